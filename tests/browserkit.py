@@ -5,6 +5,7 @@ import contextlib
 import threading
 
 import httpx
+import pytest
 from conftest import PATIENCE, eventually
 
 from reem_async import RedisInterface
@@ -71,4 +72,16 @@ class Client:
 def client_of(address, **options):
     client = Client(address, **options)
     with contextlib.closing(client.http):
+        yield client
+
+
+@pytest.fixture(scope="module")
+def address(server_url):
+    with served(live(server_url)) as (address, _):
+        yield address
+
+
+@pytest.fixture
+def ask(address):
+    with client_of(address) as client:
         yield client

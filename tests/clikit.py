@@ -43,7 +43,6 @@ def finished(*words, cwd=None, **changes):
 
 @contextlib.contextmanager
 def running(*words, env=None, **options):
-    """A command that goes on by itself; killed at the end."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
     with subprocess.Popen([REEM, *map(str, words)], env=env or environment(), **pipes) as process:
         try:
@@ -62,8 +61,6 @@ def said_until(process, start):
 
 
 class CommandLine:
-    """Runs `reem` against one server, in a namespace of its own."""
-
     def __init__(self, url, namespace):
         self.url, self.namespace = url, namespace
 

@@ -23,7 +23,6 @@ def raw_of(node):
 
 
 def owner(cluster, key):
-    """The node that has the slot of a key."""
     with raw_of(cluster.nodes[-1]) as client:
         for (first, last), row in _ranges(client):
             if first <= slot_of(key) <= last:
@@ -130,7 +129,6 @@ class Move:
 
 @contextlib.contextmanager
 def clients_of(nodes):
-    """Plain clients of several nodes."""
     with contextlib.ExitStack() as stack:
         yield [stack.enter_context(raw_of(node)) for node in nodes]
 

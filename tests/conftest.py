@@ -114,7 +114,6 @@ def server_url(request):
 
 @pytest.fixture
 def server():
-    """A server of the test's own, to be stopped and killed."""
     from reem_async.server import EmbeddedServer
 
     with EmbeddedServer() as own:
@@ -123,7 +122,6 @@ def server():
 
 @contextlib.contextmanager
 def stopped(server):
-    """The server stands still inside the block."""
     os.kill(server.pid, signal.SIGSTOP)
     try:
         yield
@@ -402,8 +400,6 @@ def _with_syntax(operation):
 
 
 class Front:
-    """The few calls that tests of both fronts need; a path begins with the top-level key."""
-
     def at(self, path):
         handle = self.kvs
         for element in path:
@@ -417,8 +413,6 @@ class Front:
 
 
 class BlockingFront(Front):
-    """`reem`, with Python's own syntax where there is some."""
-
     def __init__(self, url, space="KeyValueStore", **options):
         import reem
 
@@ -515,7 +509,6 @@ class Loop:
 
 @pytest.fixture(params=list(FRONTS))
 def open_front(request, server_url, key):
-    """Opens a front with options; all are closed at the end."""
     with contextlib.ExitStack() as stack:
 
         def open_(space="KeyValueStore", url=server_url, **options):
@@ -606,7 +599,6 @@ def nothing_fetched(raw):
 
 
 def keys_of(raw, top_key):
-    """Every Redis key that belongs to one top-level key, but for the document itself."""
     return {name for name in raw.scan_iter(match=f"*{top_key}*", count=1000) if name.startswith("{" + top_key + "}")}
 
 
@@ -682,7 +674,6 @@ def eventually(condition, timeout=PATIENCE):
 
 
 async def aeventually(condition, timeout=PATIENCE):
-    """`eventually` for asyncio."""
     deadline = time.monotonic() + timeout
     while not (value := condition()) and time.monotonic() < deadline:
         await asyncio.sleep(0.005)
@@ -733,6 +724,13 @@ def python(code, *arguments, flags=("-X", "dev", "-W", "error"), start=False, **
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
     done.stderr = SLOW_MACHINE.sub("", done.stderr)
     return done
+
+
+def assert_ends_well(*words, timeout=300):
+    """Run a program of the tests, which tells what is wrong by its exit code."""
+    command = [sys.executable, *map(str, words)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False)
+    assert done.returncode == 0, f"{command}\n{done.stdout[-6000:]}\n{done.stderr[-6000:]}"
 
 
 SLOW_MACHINE = re.compile(r"^Executing <.* took \d+\.\d+ seconds\n", re.MULTILINE)

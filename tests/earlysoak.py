@@ -8,7 +8,6 @@ says its own checksum. A process at random is killed (kill -9) every few millise
 
 import argparse
 import contextlib
-import multiprocessing
 import os
 import random
 import sys
@@ -16,48 +15,21 @@ import tempfile
 import threading
 import time
 import zlib
+from functools import partial
 from typing import Any
 
 import numpy as np
-from slots import ended, open_files, shared_memory
+from slots import PUBLISHERS, Work, ended, open_files, shared_memory
 
 import reem
 from reem_async.local import mailbox
 from reem_async.server import EmbeddedServer
 
-FORK = multiprocessing.get_context("fork")
 KEY = "arm"
-PUBLISHERS = 2
 KINDS = ("publisher",) * PUBLISHERS + ("callback", "watch", "mirror")
 COUNTED = SENT, SEEN, EARLY, TORN, UNEQUAL = range(5)
 SIZES = (0, 1 << 10, 20_000, 1 << 17)  # bytes: in the notice, in a datagram alone, and in shared memory
 PATIENCE = 60.0
-
-
-class Work:
-    """What the processes share: the server, what each has counted, killed ones included, and the end."""
-
-    def __init__(self, url: str) -> None:
-        self.url = url
-        self.counts = np.frombuffer(FORK.RawArray("q", len(KINDS) * len(COUNTED)), np.int64).reshape(len(KINDS), -1)
-        self.quiet = FORK.Event()  # publishers have ended: what subscribers have is compared
-        self._over = FORK.RawArray("b", len(KINDS))
-
-    def is_over(self, place: int) -> bool:
-        return bool(self._over[place])
-
-    def total(self, what: int) -> int:
-        return int(self.counts[:, what].sum())
-
-    def started(self, place: int) -> Any:
-        process = FORK.Process(target=publish if place < PUBLISHERS else follow, args=(self, place), daemon=True)
-        process.start()
-        return process
-
-    def end(self, place: int, process: Any) -> int | None:
-        """Have a process end by itself."""
-        self._over[place] = True
-        return ended(process)
 
 
 def made(rng: random.Random) -> dict[str, Any]:
@@ -69,16 +41,16 @@ def is_whole(value: Any) -> bool:
     return value is None or zlib.crc32(np.asarray(value["body"], np.uint8)) == value["crc"]
 
 
-def publish(work: Work, place: int) -> None:
+def publish(url: str, work: Work, place: int) -> None:
     rng, count = random.Random(os.urandom(8)), work.counts[place]
-    with reem.RedisInterface(work.url, local="early") as interface:
+    with reem.RedisInterface(url, local="early") as interface:
         space = reem.PublishSpace(interface)
         while not work.is_over(place):
             space[KEY] = made(rng)
             count[SENT] += 1
 
 
-def follow(work: Work, place: int) -> None:
+def follow(url: str, work: Work, place: int) -> None:
     count = work.counts[place]
 
     def check(data: Any, is_early: bool) -> None:
@@ -86,7 +58,7 @@ def follow(work: Work, place: int) -> None:
         count[EARLY] += is_early
         count[TORN] += not is_whole(data)
 
-    with reem.RedisInterface(work.url) as interface:
+    with reem.RedisInterface(url) as interface:
         watch = reem.SilentSubscriber(KEY, interface, stored=KINDS[place] == "watch").watch(reem.Last(100))
         mirror = reem.KeyValueStore(interface)[KEY].mirror()
         with mirror, watch:
@@ -109,7 +81,7 @@ def soak(seed: int, updates: int) -> None:
     memory, kills = shared_memory(), 0
     with tempfile.TemporaryDirectory(dir="/tmp") as folder, EmbeddedServer() as server:
         mailbox._PARENT = folder  # other programs have sockets in the usual one
-        work = Work(server.url)
+        work = Work(partial(publish, server.url), partial(follow, server.url), len(KINDS), len(COUNTED))
         before = open_files()
         processes = [work.started(place) for place in range(len(KINDS))]
         while work.total(SENT) < updates:

@@ -47,7 +47,6 @@ class Pair:
         self.mirror.listen()
 
     def publish(self, n):
-        """Publish a frame and return it as the reader has it."""
         self.space[self.key] = frame(n)
         return self.heard(n)
 

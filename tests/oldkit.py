@@ -1,9 +1,6 @@
 """Stores of old versions, as these wrote them, and what they hold."""
 
-import contextlib
 import json
-import socket
-import threading
 
 import numpy as np
 from conftest import ROOT
@@ -125,57 +122,3 @@ def everything(raw):
         for key in raw.scan_iter()
         if not key.endswith(":last")
     }
-
-
-class Cut:
-    """A way to a server that hands on a number of commands, one by one, and is dead from then on."""
-
-    def __init__(self, port, after):
-        self._target, self._left = port, after
-        self._links = []
-        self._lock = threading.Lock()
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.url = f"redis://127.0.0.1:{self._listening.getsockname()[1]}"
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self._end()
-
-    def _accept(self):
-        with contextlib.suppress(OSError):
-            while True:
-                client, _ = self._listening.accept()
-                server = socket.create_connection(("127.0.0.1", self._target))
-                for link in (client, server):
-                    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._links += [client, server]
-                threading.Thread(target=self._up, args=(client, server), daemon=True).start()
-                threading.Thread(target=self._down, args=(client, server), daemon=True).start()
-
-    def _up(self, client, server):
-        with contextlib.suppress(OSError, ValueError), client.makefile("rb") as words:
-            while line := words.readline():
-                command = line
-                for _ in range(int(line[1:])):
-                    size = words.readline()
-                    command += size + words.read(int(size[1:]) + 2)
-                with self._lock:
-                    if not self._left:
-                        self._end()
-                        return
-                    self._left -= 1
-                    server.sendall(command)
-
-    def _down(self, client, server):
-        with contextlib.suppress(OSError):
-            while data := server.recv(65536):
-                client.sendall(data)
-
-    def _end(self):
-        for link in [self._listening, *self._links]:
-            with contextlib.suppress(OSError):
-                link.shutdown(socket.SHUT_RDWR)
-            link.close()

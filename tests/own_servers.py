@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import inspect
+import random
 import socket
 import threading
 import time
@@ -54,14 +55,16 @@ def program(json=True):
 
 
 def free_port():
-    """A port that nobody has, and whose number plus 10000 is a port too (cluster nodes take both)."""
+    """A port that nobody has, and whose number plus 10000 is a port too (cluster nodes take both).
+
+    It is below those that the kernel gives to clients: one of them could be given it while its server is down.
+    """
     while True:
-        with socket.socket() as one, socket.socket() as other:
-            one.bind((HOST, 0))
-            port = one.getsockname()[1]
-            with contextlib.suppress(OSError, OverflowError):
-                other.bind((HOST, port + 10000))
-                return port
+        port = random.randrange(20_000, 32_000)
+        with socket.socket() as one, socket.socket() as other, contextlib.suppress(OSError):
+            one.bind((HOST, port))
+            other.bind((HOST, port + 10000))
+            return port
 
 
 def other_addresses():

@@ -54,7 +54,7 @@ MORE = (80.0, 8, 2)
 
 
 class Wrong(Exception):
-    """Something differs, hangs or grows."""
+    pass
 
 
 class Program:
@@ -159,8 +159,6 @@ class Observers:
 
 
 class Week:
-    """The robot and what happens to it."""
-
     def __init__(self, seed: int, folder: Path, server: PrivateServer, proxy: Proxy) -> None:
         self.rng = random.Random(seed)
         self.folder, self.server, self.proxy = folder, server, proxy

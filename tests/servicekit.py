@@ -38,7 +38,6 @@ def serve(url, key):
 
 
 def call(url, key, count, timeout="5", local="auto"):
-    """Call from four threads; each outcome is a right answer, or the name of an error."""
     place = reem.KeyValueStore(reem.RedisInterface(url, local=local))[key]
     numbers = iter(range(int(count)))
     lock = threading.Lock()

@@ -38,17 +38,17 @@ LARGEST = 1 << 16
 PATIENCE = 60.0
 """Seconds in which something must come about that takes some milliseconds on a machine with nothing else to do."""
 COUNTED = WRITTEN, FULL, SEEN, GONE, TORN, LEFT = range(6)
+NAMES = [f"\0reem-slots-{secrets.token_hex(8)}-{reader}" for reader in range(READERS)]
+"""Where readers are told."""
 
 
 class Work:
-    """What the processes share: where readers are told, what each has counted, killed ones included, and the end."""
+    """What processes share: the first of them publish, all count, killed ones included, until they are told to end."""
 
-    def __init__(self) -> None:
-        tag = secrets.token_hex(8)
-        self.names = [f"\0reem-slots-{tag}-{reader}" for reader in range(READERS)]
-        shared = FORK.RawArray("q", (PUBLISHERS + READERS) * len(COUNTED))
-        self.counts = np.frombuffer(shared, np.int64).reshape(-1, len(COUNTED))
-        self._over = FORK.RawArray("b", PUBLISHERS + READERS)
+    def __init__(self, publish: Any, read: Any, places: int, counted: int) -> None:
+        self._publish, self._read = publish, read
+        self.counts = np.frombuffer(FORK.RawArray("q", places * counted), np.int64).reshape(places, counted)
+        self._over = FORK.RawArray("b", places)
         self._parent = os.getpid()
 
     def is_over(self, place: int) -> bool:
@@ -58,12 +58,12 @@ class Work:
         return int(self.counts[:, what].sum())
 
     def started(self, place: int) -> Any:
-        process = FORK.Process(target=publish if place < PUBLISHERS else read, args=(self, place), daemon=True)
+        target = self._publish if place < PUBLISHERS else self._read
+        process = FORK.Process(target=target, args=(self, place), daemon=True)
         process.start()
         return process
 
     def end(self, place: int, process: Any) -> int | None:
-        """Have a process end by itself."""
         self._over[place] = True
         return ended(process)
 
@@ -110,7 +110,7 @@ def publish(work: Work, place: int) -> None:
             slot = local.put(KEYS, pieces, [size])
             count[FULL if slot is None else WRITTEN] += 1
             taken = False
-            for name in work.names if slot is not None else ():
+            for name in NAMES if slot is not None else ():
                 with contextlib.suppress(OSError):  # it was killed, or is behind
                     told.sendto(json.dumps([*slot, size]).encode(), name)
                     taken = True
@@ -143,7 +143,7 @@ def read(work: Work, place: int) -> None:
     reader, kept = place - PUBLISHERS, []
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as told:
         with contextlib.suppress(OSError):
-            told.bind(work.names[reader])
+            told.bind(NAMES[reader])
         local.reader  # noqa: B018 - what is imported is imported
         before = open_files()
         while not work.is_over(place):
@@ -167,7 +167,8 @@ def read(work: Work, place: int) -> None:
 
 def hunt(seed: int, uses: int) -> None:
     """Have slots written and looked into so many times."""
-    rng, work, memory = random.Random(seed), Work(), shared_memory()
+    rng, memory = random.Random(seed), shared_memory()
+    work = Work(publish, read, PUBLISHERS + READERS, len(COUNTED))
     before, begun = open_files(), time.monotonic()
     processes = [work.started(place) for place in range(PUBLISHERS + READERS)]
     kills, said = 0, begun

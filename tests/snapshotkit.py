@@ -99,7 +99,6 @@ READS = {
 
 
 def everything(raw, match="*"):
-    """All that a server holds, but for the notes of the last notice, which expire."""
     content = {}
     for key in raw.scan_iter(match=match, count=1000):
         if not key.endswith(b":last"):

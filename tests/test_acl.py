@@ -36,7 +36,6 @@ def password(secrets, user):
 
 @pytest.fixture(scope="module")
 def server(secrets):
-    """A private server that starts with the prepared ACL file."""
     with own_server(f"aclfile {secrets / 'users.acl'}", wait=False) as process:
         yield process
 

@@ -82,7 +82,6 @@ class Blocking:
         return result
 
     def recorder(self, patterns=("*",), **options):
-        """A recorder; none of those that are refused leaves a file."""
         options = {"path": self._file.with_name("other.mcap" if hasattr(self, "recording") else "run.mcap")} | options
         return self.recording_module.Recorder(self.interface, patterns, **options)
 

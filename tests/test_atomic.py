@@ -85,7 +85,6 @@ def test_image_and_stamp_are_never_read_apart(server_url, key, shape, reads):
 
 
 def test_a_plain_read_is_one_command_and_a_plain_write_needs_no_transaction(front, key, raw):
-    """As design section 3 has it."""
     front.write([key()], {"n": 1, "x": 0.5})
     before = commands_run(raw)
     front.read([key()])

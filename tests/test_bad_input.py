@@ -164,7 +164,6 @@ def test_the_line_to_write_for_other_numbers_can_be_stored(front, key, row):
 
 
 def test_a_circle_is_called_circular(front, key):
-    """Depth alone would not tell what is wrong."""
     with pytest.raises(TooDeep, match=r"(?i)circular|itself"):
         front.write([key()], circle())
 
@@ -286,7 +285,6 @@ def test_a_number_that_others_made_large_meanwhile_is_put_back(front, open_front
 
 
 def test_a_closed_interface_says_so(open_front, key):
-    """Every call after close; closing twice is fine."""
     front = open_front()
     front.write([key()], 1)
     for _ in range(2):
@@ -302,7 +300,6 @@ def test_a_wrong_option_is_a_type_error():
 
 
 def test_housekeeping_is_all_that_is_not_counted(front, key, raw):
-    """The check of these tests sees a write."""
     before = commands_run(raw)
     front.write([key()], 1)
     assert commands_run(raw) != before

@@ -1,5 +1,6 @@
 """What the browser answers, over a real port and from a real server."""
 
+# ruff: noqa: F811 - fixtures are named as arguments
 import asyncio
 import io
 import socket
@@ -8,26 +9,13 @@ import time
 import numpy as np
 import orjson
 import pytest
-from browserkit import client_of, live, served
+from browserkit import address, ask, client_of, live, served  # noqa: F401 - fixtures
 from conftest import eventually, python, repeated, sized
 from PIL import Image
 
 import reem
 from reem_async.server import EmbeddedServer
 from reem_async.tools.browser import listen
-
-
-@pytest.fixture(scope="module")
-def page(server_url):
-    with served(live(server_url)) as (address, source):
-        yield address, source
-
-
-@pytest.fixture
-def ask(page):
-    with client_of(page[0]) as client:
-        yield client
-
 
 IMAGE = np.random.default_rng(1).integers(0, 256, (40, 60, 3), np.uint8)
 
@@ -200,7 +188,7 @@ def test_search_finds_keys_and_what_is_below(ask, robot, key):
 # --- time -------------------------------------------------
 
 
-def test_the_past_is_as_it_was(ask, page, pspace, key):
+def test_the_past_is_as_it_was(ask, pspace, key):
     name = key("arm")
     before = time.time()
     pspace[name] = {"q": [0.0, 0.0], "mode": "idle"}

@@ -373,21 +373,6 @@ def test_a_stray_percent_in_the_address_is_said(visit):
     expect(page.locator("#dot")).to_have_class("dot ok")
 
 
-@pytest.mark.long
-def test_search_on_a_phone_covers_the_value(visit, kvs, key):
-    kvs[key("arm")] = {"joint": 1}
-    page = visit.open(f"/view/{key('arm')}.joint")
-    page.set_viewport_size({"width": 390, "height": 844})
-    page.locator("#search").fill(key("arm"))
-    expect(row(page, key("arm"))).to_be_visible()
-    columns = [page.locator(".columns span").last, row(page, key("arm")).locator(".age")]
-    ends = [box["x"] + box["width"] for box in [it.bounding_box() for it in columns]]
-    assert abs(ends[0] - ends[1]) < 1, "what was found stands below the heads of the columns"
-    row(page, key("arm")).click()
-    expect(page.locator("#view")).to_be_visible()
-    expect(page.locator("h1")).to_have_text(key("arm"))
-
-
 def test_the_scale_of_colours_is_there_again_after_other_tabs(visit, kvs, key):
     kvs[key()] = np.linspace(0, 1, 400).reshape(20, 20)
     page = visit.open(f"/view/{key()}")

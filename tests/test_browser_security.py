@@ -1,5 +1,6 @@
 """Who may ask the browser, and for what: other sites, other names, scripts in keys, writes."""
 
+# ruff: noqa: F811 - fixtures are named as arguments
 import html
 import re
 import socket
@@ -8,22 +9,10 @@ import urllib.parse
 import numpy as np
 import orjson
 import pytest
-from browserkit import client_of, live, served
+from browserkit import address, ask, client_of, live, served  # noqa: F401 - fixtures
 from conftest import eventually
 
 from reem_async.tools.browser.app import LOOPBACK
-
-
-@pytest.fixture(scope="module")
-def address(server_url):
-    with served(live(server_url)) as (address, _):
-        yield address
-
-
-@pytest.fixture
-def ask(address):
-    with client_of(address) as client:
-        yield client
 
 
 @pytest.fixture

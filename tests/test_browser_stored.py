@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import redis
 from conftest import LOOKING, PLAIN, RawCluster, aeventually, commands_run, same_bits, server_without_right, subscribed
 
 import reem_async
@@ -17,7 +16,6 @@ from reem_async.plan.placeholders import Unreadable
 from reem_async.plan.trees import MISSING
 from reem_async.pubsub import refresh
 from reem_async.pubsub.monitor import Monitor
-from reem_async.server import EmbeddedServer
 from reem_async.tools.browser import LiveSource
 from reem_async.tools.browser import follower as follower_module
 from reem_async.tools.browser.follower import Follower
@@ -116,20 +114,6 @@ async def test_each_way_of_storing_is_seen_when_the_server_tells_of_it(server_ur
         await seen(source, MISSING, key("gone"))
         assert source.history.tree((key(), "x", "a"), began) == 0
         assert source.history.tree((key("gone"),), began) == 1
-
-
-async def test_all_at_once(nobody_looks):
-    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as interface:
-        kvs = reem_async.KeyValueStore(interface)
-        for number in range(250):
-            await kvs[f"k{number}"].write({"n": number})
-        names = [f"k{number}" for number in range(250)]
-        async with past_of(server.url, *names) as source:
-            with redis.Redis(port=server.port) as raw:
-                raw.flushall()
-            await aeventually(lambda: all(content(source, name) is MISSING for name in names))
-            await kvs["k7"].write(7)
-            await seen(source, 7, "k7")
 
 
 async def test_a_key_that_is_new_is_found_by_its_name(server_url, key, akvs):
@@ -245,57 +229,6 @@ async def test_who_may_not_track_is_not_shown_the_present_of_an_array_for_its_pa
             assert not isinstance(sample.value, np.ndarray)
 
 
-async def test_where_it_is_not_the_first_database_nor_without_namespace(nobody_looks):
-    async with EmbeddedServer() as server:
-        url = f"{server.url.rstrip('/').removesuffix('/0')}/3"
-        async with reem_async.RedisInterface(url, namespace="robots/1:") as interface:
-            kvs = reem_async.KeyValueStore(interface)
-            await kvs["a"].write({"n": 0, "array": np.zeros(5)})
-            async with past_of(url, "a", namespace="robots/1:") as source:
-                await kvs["a"]["n"].write(1)
-                await seen(source, 1, "a", "n")
-                await kvs["a"]["array"].write(np.ones(5))
-                await seen(source, np.ones(5), "a", "array")
-
-
-async def test_all_nodes_of_a_cluster_tell(cluster, key, nobody_looks):
-    async with reem_async.RedisInterface(cluster.url) as interface:
-        kvs = reem_async.KeyValueStore(interface)
-        names = [key(f"k{number}") for number in range(20)]
-        for name in names:
-            await kvs[name].write({"n": 0, "array": np.zeros(5)})
-        async with past_of(cluster.url, *names) as source:
-            for name in names:
-                await kvs[name]["n"].write(1)
-                await kvs[name]["array"].write(np.ones(5))
-            for name in names:
-                await seen(source, 1, name, "n")
-                await seen(source, np.ones(5), name, "array")
-            for name in names:
-                await kvs[name].delete()
-            for name in names:
-                await seen(source, MISSING, name)
-
-
-@pytest.mark.long
-async def test_what_is_stored_while_the_connection_is_broken_is_seen(server_url, key, akvs, raw):
-    """An array leaves no trace in its document's text."""
-    names = [key("a"), key("b")]
-    for name in names:
-        await akvs[name].write({"n": 0, "array": np.zeros(5)})
-    async with past_of(server_url, *names) as source:
-        for number in range(1, 5):
-            for connection in subscribed(raw):
-                raw.client_kill_filter(_id=connection)
-            for name in names:
-                await akvs[name]["array"].write(np.full(5, float(number)))
-                await akvs[name]["n"].write(number)
-            for name in names:
-                await seen(source, number, name, "n")
-                await seen(source, np.full(5, float(number)), name, "array")
-            await told(source, *names)
-
-
 async def test_nothing_is_kept_of_keys_that_are_gone(server_url, key, akvs):
     async with past_of(server_url) as source:
         follower = source._follower
@@ -386,7 +319,6 @@ async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, bint
 
 @contextlib.asynccontextmanager
 async def followed_all(interface, name, akvs):
-    """A follower of all keys that has read one, and its history."""
     await akvs[name].write({"n": 1})
     follower = Follower(interface, history := History(1000.0, 1 << 24))
     await follower.start()

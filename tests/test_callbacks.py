@@ -88,7 +88,7 @@ async def test_calls_may_close_all_subscribers_at_once(ainterface, apspace, key,
 
 
 class Odd(BaseException):
-    """Neither an Exception nor one that asyncio knows."""
+    pass
 
 
 @pytest.mark.parametrize("kind", [ValueError, SystemExit, KeyboardInterrupt, Odd])
@@ -158,7 +158,6 @@ def test_what_a_call_raises_leaves_the_event_loop_and_the_subscription_goes_on(s
 
 
 async def test_a_function_that_returns_something_to_await_is_awaited(ainterface, apspace, key):
-    """A lambda around a coroutine function, between plain calls."""
     told = []
 
     async def slowly(data):

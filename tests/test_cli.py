@@ -372,18 +372,6 @@ def test_publishing_until_ctrl_c(cli, kvs):
 # --- the terminal and the pipe -------------------------------------------------
 
 
-@pytest.mark.long
-def test_colours_and_widths_are_those_of_the_terminal(cli, kvs):
-    wide, code = cli.in_terminal("ls")
-    assert code == 0
-    assert "\x1b[" in wide
-    narrow, _ = cli.in_terminal("ls", columns=44)
-    lines = narrow.replace("\x1b[1m", "").replace("\x1b[0m", "").replace("\x1b[36m", "").replace("\x1b[32m", "")
-    assert all(len(line) <= 44 for line in lines.split("\r\n")), lines
-    assert "…" in lines
-    assert "\x1b" not in cli.process("ls").stdout
-
-
 def test_a_closed_pipe_is_no_error(cli, kvs):
     kvs["many"] = {f"key{number}": "x" * 100 for number in range(3000)}  # more than a pipe holds
     with cli.running("tree", "many", "--all") as process:

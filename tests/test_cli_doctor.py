@@ -100,25 +100,6 @@ def test_a_user_who_may_do_little(own):
     assert "scan" in said
 
 
-def test_a_server_that_throws_keys_away(own):
-    url, admin = own
-    admin.config_set("maxmemory", "200mb")
-    admin.config_set("maxmemory-policy", "allkeys-lru")
-    admin.config_set("client-output-buffer-limit", "pubsub 1000000 0 0")
-    try:
-        report = findings(CommandLine(url, "")("doctor", "--json"))
-    finally:
-        admin.config_set("maxmemory", "0")
-        admin.config_set("maxmemory-policy", "noeviction")
-        admin.config_set("client-output-buffer-limit", "pubsub 33554432 8388608 60")
-    assert report["eviction"]["status"] == WARN
-    assert "allkeys-lru" in report["eviction"]["message"]
-    assert "noeviction" in report["eviction"]["remedy"]
-    assert report["subscribers"]["status"] == WARN
-    assert "1.0 MB" in report["subscribers"]["message"]
-    assert "of 209.7 MB (maxmemory)" in report["memory"]["message"]
-
-
 def nodes_with(report, check):
     return [
         (row["node"], row["status"]) for row in map(json.loads, report.stdout.splitlines()) if row["check"] == check
@@ -153,39 +134,40 @@ def test_every_node_of_a_cluster_is_examined_and_named():
 # --- what the facts mean -------------------------------------------------
 
 
-def status(check, info=None, config=None):
-    return check(Facts(info, config)).status
+SAVED = {"rdb_last_bgsave_status": "ok", "aof_enabled": "0"}
+BUFFERS = "client-output-buffer-limit"
 
 
-def test_persistence():
-    saved = {"rdb_last_bgsave_status": "ok", "aof_enabled": "0"}
-    assert status(checks.persistence, {**saved, "aof_enabled": "1"}) == OK
-    assert status(checks.persistence, saved, {"save": "3600 1"}) == OK
-    assert status(checks.persistence, saved, {"save": ""}) == WARN
-    assert status(checks.persistence, saved, None) == UNKNOWN
-    assert status(checks.persistence, {**saved, "rdb_last_bgsave_status": "err"}, {"save": "3600 1"}) == FAIL
-    assert status(checks.persistence, {"aof_last_write_status": "err", "aof_enabled": "1"}) == FAIL
-
-
-def test_memory_and_eviction():
-    assert status(checks.memory, {"used_memory": "95", "maxmemory": "100"}) == WARN
-    assert status(checks.memory, {"used_memory": "5", "maxmemory": "0", "total_system_memory": "100"}) == OK
-    assert status(checks.memory, {"used_memory": "95", "maxmemory": "0", "total_system_memory": "100"}) == WARN
-    assert status(checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "0"}) == OK
-    assert status(checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "9"}) == WARN
-    assert status(checks.eviction, {"evicted_keys": "3"}) == FAIL
-
-
-def test_subscribers():
-    def limits(text, **info):
-        return status(checks.subscribers, info, {"client-output-buffer-limit": text})
-
-    assert limits("normal 0 0 0 slave 1 1 1 pubsub 33554432 8388608 60") == OK
-    assert limits("pubsub 0 0 0") == OK
-    assert limits("pubsub 1000 0 0") == WARN
-    assert limits("pubsub 33554432 8388608 60", client_output_buffer_limit_disconnections="2") == WARN
-    assert limits("normal 0 0 0") == UNKNOWN
-    assert status(checks.subscribers, {}, None) == UNKNOWN
+@pytest.mark.parametrize(
+    ("check", "info", "config", "status"),
+    [
+        (checks.persistence, SAVED | {"aof_enabled": "1"}, None, OK),
+        (checks.persistence, SAVED, {"save": "3600 1"}, OK),
+        (checks.persistence, SAVED, {"save": ""}, WARN),
+        (checks.persistence, SAVED, None, UNKNOWN),
+        (checks.persistence, SAVED | {"rdb_last_bgsave_status": "err"}, {"save": "3600 1"}, FAIL),
+        (checks.persistence, {"aof_last_write_status": "err", "aof_enabled": "1"}, None, FAIL),
+        (checks.memory, {"used_memory": "95", "maxmemory": "100"}, None, WARN),
+        (checks.memory, {"used_memory": "5", "maxmemory": "0", "total_system_memory": "100"}, None, OK),
+        (checks.memory, {"used_memory": "95", "maxmemory": "0", "total_system_memory": "100"}, None, WARN),
+        (checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "0"}, None, OK),
+        (checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "9"}, None, WARN),
+        (checks.eviction, {"evicted_keys": "3"}, None, FAIL),
+        (checks.subscribers, {}, {BUFFERS: "normal 0 0 0 slave 1 1 1 pubsub 33554432 8388608 60"}, OK),
+        (checks.subscribers, {}, {BUFFERS: "pubsub 0 0 0"}, OK),
+        (checks.subscribers, {}, {BUFFERS: "pubsub 1000 0 0"}, WARN),
+        (
+            checks.subscribers,
+            {"client_output_buffer_limit_disconnections": "2"},
+            {BUFFERS: "pubsub 33554432 8388608 60"},
+            WARN,
+        ),
+        (checks.subscribers, {}, {BUFFERS: "normal 0 0 0"}, UNKNOWN),
+        (checks.subscribers, {}, None, UNKNOWN),
+    ],
+)
+def test_what_the_facts_mean(check, info, config, status):
+    assert check(Facts(info, config)).status == status
 
 
 def test_clock_and_latency():

@@ -194,16 +194,6 @@ async def test_how_waiting_ends(cli, space):
             assert (ending.taken, ending.tell()) == (1, code)
 
 
-def test_a_pipe_that_has_seen_enough(space, listening):
-    with listening("echo", "foo") as process:
-        space["foo"] = 1
-        assert process.stdout.readline().endswith("foo  1\n")
-        process.stdout.close()
-        space["foo"] = 2
-        assert process.wait(10) == 0
-        assert process.stderr.read() == "nothing is stored at foo yet: waiting for it\n"
-
-
 async def test_what_comes_too_fast_is_counted(cli, space, monkeypatch):
     monkeypatch.setattr(following, "_WAITING", 3)
     seen = []
@@ -234,19 +224,6 @@ def once(function):
 
 
 # --- hz, bw, delay -------------------------------------------------
-
-
-def test_bw_counts_the_bytes_that_notices_announce(listening, announced):
-    with listening("bw", "cam", "--json", "--count", "4") as process:
-        for sequence, size in enumerate((1000, 3000, 2000, 2000), start=1):
-            announced("cam", sequence, size=size)
-        said, _ = process.communicate(timeout=10)
-    (line,) = said.splitlines()
-    got = json.loads(line)
-    assert process.returncode == 0
-    assert got["bytes"] == {"mean": 2000.0, "min": 1000, "max": 3000, "std": pytest.approx(707.1, abs=0.1)}
-    assert got["bytes_per_s"] > 0
-    assert (got["path"], got["updates"], got["lost"], got["final"]) == ("cam", 4, 0, True)
 
 
 def test_delay_is_by_both_clocks(listening, announced):

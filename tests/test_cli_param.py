@@ -12,8 +12,6 @@ import reem
 
 
 class ParamCommandLine(CommandLine):
-    """`reem param COMMAND`."""
-
     def words(self, command, *arguments):
         return ["reem", "param", command, "--namespace", self.namespace, *map(str, arguments)]
 
@@ -25,7 +23,6 @@ def cli(server_url, key):
 
 @pytest.fixture
 def store(cli):
-    """A program that has declared some parameters."""
     with reem.RedisInterface(cli.url, namespace=cli.namespace) as interface:
         store = reem.KeyValueStore(interface)
         control = store["control"]

@@ -17,7 +17,6 @@ from reem_async.tools.recording import open_log
 
 @pytest.fixture
 def kvs(cli):
-    """In the namespace of the command line."""
     with reem.RedisInterface(cli.url, namespace=cli.namespace) as interface:
         yield reem.KeyValueStore(interface)
 

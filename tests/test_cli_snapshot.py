@@ -12,7 +12,7 @@ import pytest
 import redis
 import typer
 from clikit import environment, in_terminal, invoked, running
-from conftest import assert_same, eventually, line_of
+from conftest import assert_same, line_of
 
 import reem
 from reem_async.server import EmbeddedServer
@@ -246,18 +246,6 @@ def test_by_period_it_outlives_the_server(tmp_path):
             assert process.returncode == 0
     with periodic("-d", tmp_path, "--every", "1s", REEM_URL="redis://127.0.0.1:1") as process:
         assert process.wait(20) == 1, "what has never worked is an error"
-
-
-def test_ctrl_c_leaves_no_half_file(kvs, env, tmp_path):
-    for number in range(60):
-        kvs[f"k{number}"] = np.zeros(500_000)
-    with periodic(tmp_path / "a.zip", **env) as process:
-        eventually(lambda: any(name.endswith(".part") for name in names(tmp_path)))
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=20)
-    assert process.returncode == 130
-    assert "Traceback" not in errors
-    assert names(tmp_path) == []
 
 
 def test_in_a_terminal(kvs, env, tmp_path):

@@ -4,7 +4,6 @@ import ast
 import re
 
 import numpy as np
-from clikit import invoked
 from conftest import ROOT
 
 import reem as blocking
@@ -65,26 +64,6 @@ def test_no_message_advises_what_cannot_be_typed():
         and not any(known in text for known in OF_PROGRAMS.get(file, ()))
     ]
     assert wrong == []
-
-
-def test_options_are_named_as_they_are_typed(cli, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    cli.result("set", "a", "[1]")
-    assert "a list only grows by appending" in cli.error(1, "set", "a[5]", "1")
-    assert "store it as text or as a float" in cli.error(2, "set", "a", "9" * 30)
-    for words, code, advice in [
-        (("save", "a.zip"), 0, ""),
-        (("save", "a.zip"), 2, "replace it with overwrite=True or --force"),
-        (("restore", "a.zip"), 1, "(--replace) replaces them, another namespace= (--namespace)"),
-    ]:
-        words = ["snapshot", *words, "--namespace", cli.namespace]
-        run = invoked(*words, REEM_URL=cli.url)
-        assert run.returncode == code, run.stderr
-        assert advice in run.stderr
-    assert "there is no option foo; see redis-py's connection options" in cli.error(
-        2, "get", "a", "--url", "redis://localhost?foo=1"
-    )
-    assert "'--rate'" in cli.error(2, "play", "no.mcap", "--rate", "0")
 
 
 def test_a_value_of_a_ship_says_that_a_program_reads_it(cli):

@@ -134,7 +134,6 @@ async def test_loops_do_not_wait_for_a_task_that_is_slow_to_end(server_url, key)
 
 @pytest.fixture
 def short_turns():
-    """Threads take turns as often as can be."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield

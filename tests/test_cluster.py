@@ -14,7 +14,6 @@ import reem_async
 from reem_async.errors import BadValue, NotConnected, ServerFailed, WrongKind
 from reem_async.pubsub.monitor import Monitor
 from reem_async.server.cluster import EmbeddedCluster
-from reem_async.store.catalog import names
 
 
 @pytest.fixture
@@ -130,16 +129,6 @@ def test_keys_go_to_the_node_of_their_slot_and_all_of_a_key_to_one(front, cluste
         with raw_of(owner(cluster, name)) as raw:
             assert raw.exists(name, "{" + name + "}.image", "{" + name + "}:ships") == 3
         assert front.read((name, "image")).tolist() == list(range(10))
-
-
-async def test_all_nodes_are_listed(cluster, key):
-    async with reem_async.RedisInterface(cluster) as interface:
-        there = {key(f"n{number}") for number in range(30)}
-        for name in there:
-            await reem_async.KeyValueStore(interface)[name].write(1)
-        listed = [name async for name in names(interface, key("n*"))]
-    assert len(listed) == len(there)
-    assert set(listed) == there
 
 
 def test_a_foreign_type_is_named_by_the_node_that_has_it(front, cluster, key):

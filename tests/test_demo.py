@@ -45,7 +45,6 @@ def demo(**environment):
 
 
 def programs(port):
-    """The robot's programs that are connected to a port's server, by their command lines."""
     found = subprocess.run(["ps", "-axwwo", "args"], capture_output=True, text=True, check=True).stdout
     return [line for line in found.splitlines() if "demo.robot" in line and line.endswith(f":{port}")]
 

@@ -78,7 +78,6 @@ def test_what_an_evicted_subscriber_missed_is_told_number_by_number(key):
 
 
 def told(updates, last, published, dropped):
-    """Check that all numbers after `last` are accounted for."""
     missing, lost_unknown, unaccounted = 0, False, 0
     for update in updates:
         if update.gap:

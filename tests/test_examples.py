@@ -31,7 +31,6 @@ def start(module, *arguments, **environment):
 
 
 def run(module, *arguments, code=0, **environment):
-    """Run an example to its end; returns what it printed, on standard error if it should fail."""
     process = start(module, *arguments, **environment)
     try:
         out, err = process.communicate(timeout=60)
@@ -92,7 +91,6 @@ def test_the_image_system_runs_as_three_processes(front, url, tmp_path):
 
 @pytest.mark.long
 def test_the_demo_needs_no_server(tmp_path):
-    """`make demo`, but shorter: it starts one of its own."""
     printed = run("image_system", "--seconds", 1, "--out", tmp_path / "last.png")
     assert counts(printed)[0][0] == 30
     assert (tmp_path / "last.png").stat().st_size > 10_000

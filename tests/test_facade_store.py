@@ -21,7 +21,6 @@ from reem import CallbackSubscriber, Conflict, KeyValueStore, RedisInterface, Si
 
 
 def test_a_with_block_that_raises_or_is_overtaken_writes_nothing(kvs, key, server_url):
-    """The exception passes through; somebody else's change is a Conflict."""
     kvs[key()] = {"n": 1}
     with pytest.raises(ZeroDivisionError), kvs[key()] as value:
         value["n"] = 1 / 0
@@ -32,14 +31,10 @@ def test_a_with_block_that_raises_or_is_overtaken_writes_nothing(kvs, key, serve
     assert kvs[key()].read() == {"n": 3}
 
 
-# --- connecting ------------------------------------------------------------------------------------
-
-
 # --- threads and visibility ------------------------------------------------------------------------
 
 
 def test_several_threads_share_one_interface(kvs, key, raw):
-    """Each gets its own values, and no increment is lost."""
     kvs[key()] = {"count": 0}
 
     def work(me):
@@ -241,7 +236,6 @@ def test_a_program_ends_quietly_however_it_leaves(server_url, key, leaving):
 
 @pytest.mark.parametrize("blocked", ["for update in kvs[key].watch(): print('got', flush=True)", "sub_loop()"])
 def test_ctrl_c_interrupts_a_blocking_call(server_url, key, blocked):
-    """It raises KeyboardInterrupt in the caller, at once."""
     code = (
         "import sys, reem\n"
         "url, key = sys.argv[1:]\n"
@@ -273,7 +267,6 @@ def test_ctrl_c_interrupts_a_blocking_call(server_url, key, blocked):
 
 
 def test_callbacks_run_on_a_thread_of_their_own_and_may_use_reem(interface, kvs, pspace, key):
-    """Read, write, publish and even subscribe, without deadlock."""
     threads = set()
 
     def process(data, updated_path):

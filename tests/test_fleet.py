@@ -91,7 +91,6 @@ USER = re.search(r"```text\nuser r1 (.*?)```", (ROOT / "docs/fleet.md").read_tex
 
 @pytest.fixture
 def robot_url(cluster):
-    """The address for the user `r1`, who may use one namespace."""
     rules = [rule for rule in USER[1].replace("\\\n", " ").split() if rule != "#HASH"]
     for node in cluster.nodes:
         with raw_of(node) as raw:

@@ -1,7 +1,6 @@
 """What subscribers of both fronts do: mirrors, callbacks and loops, each promise written once."""
 
 import asyncio
-import contextlib
 import logging
 
 import numpy as np
@@ -15,10 +14,8 @@ from reem_async.errors import QueueFull, ReadOnly
 
 
 class Following:
-    """What follows through one front, and is closed at the end."""
-
-    def __init__(self, front, stack):
-        self.front, self.stack = front, stack
+    def __init__(self, front):
+        self.front = front
         self.module = reem_async if isinstance(front, FRONTS["asyncio"]) else reem
         self.until, self.take = front.until, front.take
 
@@ -30,7 +27,6 @@ class Following:
 
     def _begun(self, subscriber):
         self.front.wait(subscriber.listen())
-        self.stack.callback(lambda: self.front.wait(subscriber.close()))
         return subscriber
 
     def watch(self, channel, **options):
@@ -39,12 +35,10 @@ class Following:
 
 @pytest.fixture
 def following(front):
-    with contextlib.ExitStack() as stack:
-        yield Following(front, stack)
+    return Following(front)
 
 
 def test_reading_a_mirror_is_local_and_gives_copies(following, kvs, key, raw):
-    """Plain calls that send nothing, and copies that may be changed."""
     kvs[key()] = {"number": 5, "l": [1]}
     mirror = following.mirror(key())
     with nothing_sent(raw):
@@ -58,7 +52,6 @@ def test_reading_a_mirror_is_local_and_gives_copies(following, kvs, key, raw):
 
 
 def test_a_mirror_cannot_be_written(following, kvs, key):
-    """It only follows the server: neither assigned to nor deleted from."""
     kvs[key()] = {"a": 1}
     mirror = following.mirror(key())
     with pytest.raises(ReadOnly):
@@ -145,7 +138,6 @@ def as_callback(request, following):
 
 
 def test_a_callback_gets_data_path_and_its_keyword_arguments(following, as_callback, pspace, key):
-    """The whole structure below the channel, and the updated path as a string."""
     calls = []
     function = as_callback(lambda data, updated_path, foo, scale=1: calls.append((data, updated_path, foo, scale)))
     following.calls(key("c"), function, {"foo": 5})
@@ -202,7 +194,6 @@ def test_a_loop_begins_with_what_is_there_and_then_tells_every_update(following,
 
 
 def test_subscribers_are_iterators(following, pspace, key):
-    """As `watch()` is, and a loop that was left leaves them usable."""
     begin = iter if following.module is reem else aiter
     for subscriber in (following.mirror(key()), following.calls(key(), lambda data, updated_path: None)):
         pspace[key()] = 0
@@ -215,7 +206,6 @@ def test_subscribers_are_iterators(following, pspace, key):
 
 
 def overfilled(following, kvs, pspace, key, **options):
-    """A watch that nobody takes anything from while twenty updates come."""
     kvs[key()] = -1
     updates = following.watch(key(), **options)
     assert following.take(updates)[0].initial
@@ -226,7 +216,6 @@ def overfilled(following, kvs, pspace, key, **options):
 
 @pytest.mark.parametrize(("policy", "kept"), [(None, 1), (Newest(), 1), (Last(5), 5), (Every(100), 20)], ids=repr)
 def test_a_queue_is_bounded_by_a_named_policy_and_counts_what_it_dropped(following, kvs, pspace, key, policy, kept):
-    """Newest only by default, the last n, or every one."""
     updates = overfilled(following, kvs, pspace, key, **({} if policy is None else {"policy": policy}))
     following.until(lambda: updates.dropped == 20 - kept)
     assert [update.data for update in following.take(updates, kept)] == list(range(20 - kept, 20))
@@ -234,7 +223,6 @@ def test_a_queue_is_bounded_by_a_named_policy_and_counts_what_it_dropped(followi
 
 
 def test_every_one_beyond_its_bound_is_an_error(following, kvs, pspace, key):
-    """A subscriber that asked for all must not miss some silently."""
     updates = overfilled(following, kvs, pspace, key, policy=Every(5))
     following.until(lambda: updates.dropped)
     got = []
@@ -245,7 +233,6 @@ def test_every_one_beyond_its_bound_is_an_error(following, kvs, pspace, key):
 
 
 def test_all_subscribers_of_an_interface_share_one_connection(following, kvs, pspace, key, raw):
-    """However many there are, and none is left after close."""
     before = subscribed(raw)
     mirrors = [following.mirror(key(f"c{n % 5}")) for n in range(20)]
     following.calls(key("c1"), lambda data, updated_path: None)

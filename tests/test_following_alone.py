@@ -20,15 +20,12 @@ PATIENCE = 10
 
 
 class Mine(reem_async.BytesShip):
-    """A ship that others lack."""
-
     def get_label(self):
         return "mine"
 
 
 @pytest.fixture
 async def other(server):
-    """The interface of another program."""
     async with reem_async.RedisInterface(server, ships=[reem_async.NumpyShip(), Mine()]) as other:
         yield other
 
@@ -48,7 +45,6 @@ async def following(interface, name):
 
 
 async def cancelled(call, moment):
-    """Begin a call, and cancel it at a moment."""
     task = asyncio.ensure_future(call)
     await moment
     task.cancel()

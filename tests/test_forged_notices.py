@@ -17,6 +17,7 @@ import reem
 import reem_async
 from reem_async.concurrency.queues import Every
 from reem_async.errors import BadData, BadKey, BadValue
+from reem_async.local.segment import host
 from reem_async.monitor import Monitor
 from reem_async.plan import notices
 from reem_async.plan.changes import EncodedAttachment
@@ -32,7 +33,6 @@ NAN, HUGE = b"NaN", b"9" * 400
 
 
 def forged(path=(), value=b"5", *, who="evil", number=1, when=None, kind="set", parts=(), size=None, more=()):
-    """A notice as anybody can make it."""
     when = time.time() if when is None else when
     head = [1, who, number, when, list(path), kind, len(value) if size is None else size, list(parts), *more]
     return orjson.dumps(head) + b"\n" + (value if kind == "set" else b"")
@@ -97,6 +97,8 @@ SOUND = {
     "a number far ahead": forged(number=(1 << 53) - 1),
     "a deletion": forged(kind="delete", size=0),
     "something large": forged(kind="look", size=10**12),
+    "a slot of another host": forged(kind="look", parts=[["a", 1, 2, 3, 4, 5, 2], ["numpy", ".image", 100]]),
+    "a slot of another program": forged(kind="look", parts=[[host(), 1, 0, 1, 0, 7, 2], ["numpy", ".image", 100]]),
     "an integer of 25 digits": forged(value=b"1" * 25),
     "a list where a dict is": forged([3, "x"]),
     "a deep path": forged(["a"] * 120, kind="look"),
@@ -199,7 +201,6 @@ def test_patterns_fit_what_the_server_says_they_fit(server_url, key):
 
 
 def test_a_number_that_is_made_up_hides_none_of_those_that_follow():
-    """However far ahead or back, once or twice."""
     numbers = Numbers()
     assert [numbers.take("p", number) for number in (1, 2, 10**15, 3, 4)] == [0, 0, 10**15 - 3, 0, 0]
     assert [numbers.take("p", number) for number in (1, 5, 6)] == [-1, 0, 0]

@@ -66,7 +66,6 @@ def test_a_handle_taken_for_its_value_says_how_to_read(kvs, pspace, akvs_handle,
 
 @pytest.fixture
 def akvs_handle(server_url, key):
-    """A handle of the other front; nothing is ever sent."""
     return reem_async.KeyValueStore(reem_async.RedisInterface(server_url))[key()]["n"]
 
 
@@ -150,7 +149,6 @@ def test_what_a_dict_user_types(kvs, key, raw):
 
 
 def test_pop_removes_and_returns(kvs, key, raw):
-    """Of dicts, lists and the store, arrays too, and nothing is left behind."""
     kvs[key()] = {"n": 1, "image": np.arange(6), "l": [1, np.arange(2), 3], "deep": {"x": np.ones(2)}}
     assert kvs[key()].pop("n") == 1
     assert_same(kvs[key()].pop("image"), np.arange(6))
@@ -172,7 +170,6 @@ def test_pop_removes_and_returns(kvs, key, raw):
 
 
 def test_of_many_who_pop_one_gets_each(kvs, key, server_url):
-    """Atomic: an item goes to one of them, once."""
     kvs[key()] = list(range(40))
     got: list[int] = []
 
@@ -194,7 +191,6 @@ def test_of_many_who_pop_one_gets_each(kvs, key, server_url):
 
 
 def test_update_stores_all_or_none_in_one_transaction(kvs, key, raw):
-    """What it replaces is gone, what it does not name stays."""
     kvs[key()] = {"n": 1, "stays": 2, "image": np.arange(3)}
     kvs[key()].update({"n": 2, "image": "none"}, force=np.ones(3), t=(1, 2))
     assert_same(kvs[key()].read(), {"n": 2, "stays": 2, "image": "none", "force": np.ones(3), "t": [1, 2]})
@@ -211,7 +207,6 @@ def test_update_stores_all_or_none_in_one_transaction(kvs, key, raw):
 
 
 def test_update_where_there_is_no_dict_stores_nothing(kvs, key, raw):
-    """Of no key, and says what is missing."""
     kvs[key()] = {"n": 1, "l": [{"x": 1}, np.arange(2)]}
     for place in (kvs[key("none")], kvs[key()]["n"], kvs[key()]["none"], kvs[key()]["l"]):
         for values in ({"a": 1, "b": 2}, {"a": 1, "b": np.ones(2)}, {"a": 1}, {"b": np.ones(2)}):
@@ -230,7 +225,6 @@ def test_update_where_there_is_no_dict_stores_nothing(kvs, key, raw):
 
 
 def test_an_update_is_published_value_by_value(kvs, pspace, key):
-    """In its order, and none is missing after one that was refused."""
     pspace[key()] = {}
     with kvs[key()].watch(reem.Last(10)) as updates:
         assert next(updates).initial

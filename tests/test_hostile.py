@@ -117,7 +117,6 @@ def little_memory():
 
 
 def timed(function, *arguments):
-    """Call, and fail if it takes over 50 ms three times in a row: once, and it may have been a new page of memory."""
     for _ in range(3):
         begun = time.thread_time()
         result = function(*arguments)
@@ -293,7 +292,6 @@ DTYPES = [
 
 
 def armed(dice):
-    """An array of any dtype, shape and layout whose memory is full of commands."""
     dtype = np.dtype(dice.choice(DTYPES))
     shape = tuple(dice.choice((1, 2, 3, 7, 40)) for _ in range(dice.randrange(4)))
     if dice.random() < 0.02:

@@ -11,12 +11,11 @@ import time
 
 import numpy as np
 import pytest
-from conftest import ROOT, assert_same, eventually, sized
+from conftest import assert_ends_well, assert_same, eventually, sized
 
 from reem_async import transport
 from reem_async.concurrency.locks import Locks, Pipe
-from reem_async.concurrency.queues import EMPTY, BoundedQueue, Ended, Every, Last, Newest
-from reem_async.errors import QueueFull
+from reem_async.concurrency.queues import EMPTY, BoundedQueue, Ended, Last, Newest
 from reem_async.plan.keys import keys_of
 from reem_async.plan.replies import decoded
 from reem_async.pubsub.events import Update
@@ -28,7 +27,6 @@ PATIENCE = 30.0
 
 
 def elsewhere(work):
-    """Run `work` on another thread; whether it ended in time."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(PATIENCE)
@@ -47,11 +45,7 @@ def test_signals_at_random_instants_in_every_blocking_call(server_url, key, mode
     """Every call ends, other threads go on, and nothing crashes; `tests/interruptkit.py` does the same for longer."""
     words = ("--mode", mode, "--seconds", sized("1.5", "5"), "--seed", str(SEED))
     words += ("--url", server_url, "--prefix", f"{key.prefix}:")
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "tests/interruptkit.py"), *words],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout[-3000:]}\n{done.stderr[-6000:]}"
+    assert_ends_well("tests/interruptkit.py", *words, timeout=60)
 
 
 def test_ctrl_c_between_the_steps_of_a_call_leaves_nothing_watched(kvs, key, raw, monkeypatch):
@@ -135,16 +129,6 @@ def test_a_queue_tells_what_was_lost_before_updates_that_it_dropped():
     box.close()
     with pytest.raises(Ended):
         box.take()
-
-
-def test_a_queue_that_may_drop_nothing_fails_after_what_it_has():
-    """What came in time is taken, then QueueFull."""
-    box = BoundedQueue(Every(2))
-    for number in range(1, 5):
-        box.put(update(number))
-    assert [box.take().sequence, box.take().sequence, box.dropped] == [1, 2, 1]
-    with pytest.raises(QueueFull):
-        box.take_waiting()
 
 
 def none_left(*_):

@@ -362,7 +362,6 @@ def test_who_never_hears_of_what_is_published_gives_up():
 
 
 def test_the_queue_does_no_input_or_output():
-    """It knows no loop, socket or client."""
     for name in ("tools/recording/key_queue", "pubsub/division"):
         path = ROOT / "reem_async" / f"{name}.py"
         assert roots(path) <= set(sys.stdlib_module_names) | {"reem_async"}

@@ -112,7 +112,6 @@ def test_a_dropped_watch_of_the_blocking_front_is_unsubscribed(server_url, key):
 
 
 async def test_a_store_and_its_transport_keep_a_bounded_number_of_keys(server_url, key):
-    """Whatever they keep for a key is made anew when it is gone."""
     async with reem_async.RedisInterface(server_url) as interface:
         pspace = reem_async.PublishSpace(interface)
         for number in range(2100):

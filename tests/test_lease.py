@@ -328,7 +328,6 @@ def hammer(url, name, seconds, seed, log):
 
 
 def cut(raw, name, seconds):
-    """Cut connections at random."""
     end = time.monotonic() + seconds
     node = raw.get_node_from_key(name).redis_connection if isinstance(raw, RawCluster) else raw
     while time.monotonic() < end:

@@ -30,7 +30,6 @@ pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memor
 
 @pytest.fixture
 def folder(monkeypatch):
-    """A folder for the mailboxes of this test alone."""
     parent = tempfile.mkdtemp(dir="/tmp")
     monkeypatch.setattr(mailbox, "_PARENT", parent)
     yield f"{parent}/reem-{os.getuid()}"
@@ -69,7 +68,6 @@ class Pair:
 
     @property
     def mailboxes(self):
-        """Those of the publisher and of the subscriber."""
         return self.one.session.local.subscribers._mailbox, self.other.session.subscriptions._inbox.early._mailbox
 
 
@@ -78,7 +76,6 @@ def descriptors():
 
 
 def child(work):
-    """The exit code of a forked child that does this work."""
     pid = os.fork()
     if pid == 0:
         with contextlib.suppress(BaseException):
@@ -311,7 +308,6 @@ def test_datagrams_of_another_user_are_not_read(folder):
 
 
 def hostile(channel):
-    """Datagrams that no program of REEM sends."""
     notice = b'[1,"evil",2,1.0,[],"set",5,[]]\n[{}]x'
     return {
         "nothing": b"",

@@ -7,6 +7,8 @@ import mmap
 import os
 import signal
 import socket
+import stat
+from pathlib import Path
 
 import numpy as np
 import orjson
@@ -53,7 +55,6 @@ def descriptors():
 
 @pytest.fixture
 def uncollected():
-    """What earlier tests have left is not finalized in the steps of a test."""
     gc.collect()
     gc.disable()
     yield
@@ -65,7 +66,6 @@ def interrupt():
 
 
 def check_all_slots(segment):
-    """Every slot can be written and read, and is free again afterwards."""
     readers = [LocalReader() for _ in range(SLOTS)]
     views = [reader.view(put(segment, b"%d" % number), 1) for number, reader in enumerate(readers)]
     assert [bytes(view) for view in views] == [b"%d" % number for number in range(SLOTS)]
@@ -310,6 +310,18 @@ def fifo(folder):
     return os.open(folder / "fifo", os.O_RDWR)
 
 
+def named(kind):
+    """A file of this kind with the name of REEM's memory: in the root folder, and deleted."""
+    path = Path("/memfd:reem")
+    try:
+        os.mknod(path, kind | 0o600, os.makedev(1, 5))
+        return os.open(path, os.O_PATH)
+    except PermissionError:
+        pytest.skip("only root can make it")
+    finally:
+        path.unlink(missing_ok=True)
+
+
 OPENED = {
     "fifo": fifo,
     "device": lambda _: os.open("/dev/zero", os.O_RDONLY),
@@ -318,6 +330,9 @@ OPENED = {
     "file": lambda folder: os.open(folder / "file", os.O_RDWR | os.O_CREAT),
     "socket": lambda _: socket.socket(socket.AF_UNIX).detach(),
     "pipe": lambda _: os.pipe()[0],
+    "fifo of that name": lambda _: named(stat.S_IFIFO),
+    "device of that name": lambda _: named(stat.S_IFCHR),
+    "file of that name": lambda _: named(stat.S_IFREG),
     "another name": lambda _: sealed(identity(1, 4096), "other", size=2 * HEAD),
     "nothing in it": lambda _: sealed(b""),
     "not sealed": lambda _: sealed(identity(1, 4096), seals=0, size=2 * HEAD),

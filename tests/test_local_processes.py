@@ -50,7 +50,6 @@ def following(server_url):
 
 @pytest.fixture
 def mirror(following, key):
-    """What a subscriber of this process has of the key."""
     mirror = reem.SilentSubscriber(key("cam"), following)
     mirror.listen()
     return mirror

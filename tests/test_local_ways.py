@@ -22,7 +22,6 @@ RECORDS["time"] = np.arange(5000)
 
 @contextlib.contextmanager
 def heard(url, name, **options):
-    """What a callback gets of what is published at `name`, by another interface."""
     updates = []
     with reem.RedisInterface(url, **options) as interface:
         subscriber = reem.CallbackSubscriber(name, interface, lambda data, updated_path: updates.append(data))

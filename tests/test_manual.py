@@ -13,7 +13,6 @@ from reem.ships import SpecialDatatypeShip
 
 @pytest.fixture
 def opened(server_url, key):
-    """Makes interfaces as the manual does, and closes them in the end."""
     interfaces = []
 
     def open_(**options):

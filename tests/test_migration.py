@@ -9,9 +9,10 @@ import numpy as np
 import oldkit
 import pytest
 import redis
+from chaos.proxy import Proxy
 from clikit import CommandLine
 from conftest import assert_same, eventually, sized
-from oldkit import A, Cut, Pose, PoseShip, everything, replay, ships, stored
+from oldkit import A, Pose, PoseShip, everything, replay, ships, stored
 
 import reem
 import reem_async
@@ -230,16 +231,18 @@ def test_it_reads_as_it_did_and_nothing_old_is_left(kvs, raw, version):
     ],
 )
 def test_broken_off_at_any_command_and_run_again(own, raw, version, only):
-    after, cut_short = 0, True
+    sent, cut_short = 1, True
     while cut_short:
         raw.flushall()
         replay(raw, version, only)
-        with Cut(own.port, after) as cut:
+        with Proxy(own.port) as proxy:
+            proxy.left = sent
             try:
-                with reem.RedisInterface(cut.url, ships=ships()) as interface:
+                with reem.RedisInterface(proxy.url, ships=ships()) as interface:
                     cut_short = bool(migrate(interface).problems)
             except redis.exceptions.RedisError:
                 cut_short = True
+            assert proxy.settled()
         with reem.RedisInterface(own, ships=ships()) as interface:
             store = reem.KeyValueStore(interface)
             for name in only:
@@ -248,8 +251,8 @@ def test_broken_off_at_any_command_and_run_again(own, raw, version, only):
             assert migrate(interface).problems == ()
             check(store, version, only)
         assert old_keys(raw) == []
-        after += sized(13, 1)
-    assert after > 60
+        sent += sized(700, 30)
+    assert sent > 3000
 
 
 async def test_broken_off_at_any_step_in_a_cluster(cluster):

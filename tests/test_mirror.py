@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 import math
 import os
 import random
@@ -41,12 +42,7 @@ class Mirrored:
 
 @pytest.fixture
 def mirrored(front):
-    with contextlib.ExitStack() as stack:
-
-        def begin(path, **options):
-            return stack.enter_context(contextlib.closing(Mirrored(front, path, **options)))
-
-        yield begin
+    return functools.partial(Mirrored, front)
 
 
 def test_a_mirror_answers_from_memory_what_anybody_stored_or_published(mirrored, kvs, pspace, raw, key):
@@ -77,7 +73,6 @@ def test_a_mirror_answers_from_memory_what_anybody_stored_or_published(mirrored,
 
 
 def test_waiting_ends_at_once_later_or_in_vain(mirrored, kvs, key):
-    """The predicate gets None where nothing is; what it raises is raised."""
     it = mirrored((key(),))
     assert it.until(lambda value: value is None) is None
     with pytest.raises(TimeoutError, match=key()):

@@ -43,7 +43,6 @@ def test_defaults_and_every_other_call_stay_as_they_are(front, key):
 
 
 def test_the_reader_of_one_key_does_the_same(interface, key):
-    """`Reader.read_from_redis`."""
     reader = reem.Reader(key(), interface)
     assert reader.read_from_redis(".") is None
     assert reader.read_from_redis(".a.b") is None
@@ -53,7 +52,6 @@ def test_the_reader_of_one_key_does_the_same(interface, key):
 
 
 def test_accessors_get_with_a_default(kvs, key):
-    """Of the value itself, and of an element as in REEM 0.1."""
     assert kvs[key()].get(5) == 5
     assert kvs[key()].get() is None
     assert kvs[key()].get("element", 5) == 5
@@ -77,7 +75,6 @@ def test_a_single_array_makes_the_top_level_dict(open_front, key, raw, space, va
 
 
 def test_followers_see_the_dict_that_an_array_made(interface, pspace, key):
-    """Of the whole key and of the place in it."""
     mirrors = [reem.SilentSubscriber(name, interface) for name in (key(), f"{key()}.image")]
     with contextlib.ExitStack() as stack:
         for mirror in mirrors:
@@ -89,7 +86,6 @@ def test_followers_see_the_dict_that_an_array_made(interface, pspace, key):
 
 
 def test_errors_have_the_classes_by_which_programs_of_before_catch_them():
-    """Programs of REEM 0.0 and 0.1 catch redis-py's."""
     for error in (MissingKey, NotFinite, Overflow, PathRefused, TooDeep, WrongType):
         assert issubclass(error, redis.exceptions.ResponseError)
         assert issubclass(error, reem.ReemError)

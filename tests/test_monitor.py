@@ -12,7 +12,7 @@ from reem_async.concurrency.queues import Every, Last
 from reem_async.errors import BadKey, InterfaceClosed, MissingKey, QueueFull
 from reem_async.plan.paths import escaped, parse_pattern
 from reem_async.pubsub.monitor import ANNOUNCED, Monitor
-from reem_async.store.catalog import names, outline
+from reem_async.store.catalog import outline
 
 SIZE = 200_000
 
@@ -31,16 +31,6 @@ async def test_keys_lists_what_is_there_and_nothing_else(akvs, kvs, key, raw):
     assert await akvs.keys(key("foo")) == [key("foo")]
     assert await akvs.keys(key("cam?")) == [key("cam1")]
     assert set(mine) <= set(await akvs.keys())
-
-
-async def test_keys_keep_to_their_namespace_even_if_it_looks_like_a_pattern(server_url, key):
-    async with (
-        reem_async.RedisInterface(server_url, namespace=key("n*:")) as starred,
-        reem_async.RedisInterface(server_url, namespace=key("nx:")) as other,
-    ):
-        await reem_async.KeyValueStore(starred)["foo"].write(1)
-        await reem_async.KeyValueStore(other)["bar"].write(1)
-        assert [name async for name in names(starred)] == ["foo"]
 
 
 async def test_outline_tells_what_is_there_without_fetching_arrays(akvs, ainterface, key, raw):

@@ -28,7 +28,6 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(params=list(FRONTS))
 def connect(request):
-    """Opens either front at a host and port; all are closed at the end."""
     with contextlib.ExitStack() as stack:
 
         def open_(port, host="localhost", **options):
@@ -45,7 +44,6 @@ def ways(server):
 
 
 def goes_on(front, value=1):
-    """Write and read: small, and large enough for a connection of its own."""
     front.write(["a"], {"n": value, "image": np.full(100_000, value)})
     assert front.read(["a", "n"]) == value
     assert front.read(["a", "image"])[-1] == value

@@ -91,7 +91,6 @@ def test_a_peer_that_talks_nonsense_costs_an_error_of_reems_own(name, reply, cap
 
 @both
 def test_a_peer_that_does_not_greet_like_a_server_is_not_connected_to(name):
-    """Whatever it says; a greeting that is not ended costs a second."""
     endless = ("a length", "a count", "zeros", "an empty push")
     for title, reply in NONSENSE.items():
         if not title.startswith(endless):

@@ -56,7 +56,6 @@ def test_all_of_a_module_by_an_asterisk(module, without):
 
 
 def test_they_are_the_very_classes_of_today():
-    """So that `isinstance` and `except` mean the same by either name."""
     connection = importlib.import_module("reem.connection")
     for name in ("KeyValueStore", "PublishSpace", "SilentSubscriber", "CallbackSubscriber", "Writer", "Reader"):
         assert getattr(connection, name) is getattr(reem, name)

@@ -32,7 +32,6 @@ def server():
 
 @pytest.fixture(params=list(FRONTS))
 def publisher(request, server):
-    """Makes either front with a PublishSpace of a policy."""
     with contextlib.ExitStack() as stack:
 
         def make(policy, url=server.url, **options):
@@ -46,7 +45,6 @@ def publisher(request, server):
 
 @pytest.fixture
 def reader(server):
-    """A blocking store, of an interface made when it is asked for."""
     with contextlib.ExitStack() as stack:
         yield lambda: reem.KeyValueStore(stack.enter_context(reem.RedisInterface(server.url)))
 
@@ -270,7 +268,6 @@ def test_what_is_refused_afterwards_is_logged_and_counted(publisher, server, cap
 
 
 def test_memory_is_bounded(publisher, server, reader, monkeypatch):
-    """The oldest go first; a value that is too large by itself goes too."""
     monkeypatch.setattr(outage, "_MOST", 10_000)
     front = publisher("newest")
     front.write(["a"], {})

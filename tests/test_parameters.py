@@ -134,7 +134,6 @@ def declared(open_front, namespace):
 
 @pytest.fixture
 def store(server_url, namespace):
-    """Another program."""
     with reem.RedisInterface(server_url, **namespace) as interface:
         yield reem.KeyValueStore(interface)
 

@@ -40,7 +40,6 @@ ONLY_BLOCKING = {
 
 
 def made(package, name):
-    """A documented class, or that of an accessor or of a loop over updates."""
     if name not in ("accessor", "watch", "mirror"):
         return getattr(package, name)
     accessor = package.KeyValueStore(package.RedisInterface("localhost"))["foo"]
@@ -48,7 +47,6 @@ def made(package, name):
 
 
 def public(kind):
-    """The public attributes of a class that it, or a base of ours, defines."""
     return {
         name: value
         for base in reversed(kind.__mro__)

@@ -8,7 +8,7 @@ import numpy as np
 import orjson
 import pytest
 import redis
-from conftest import FRONTS, PLAIN, assert_same, eventually, placeholders
+from conftest import PLAIN, assert_same, eventually, placeholders
 from plainkit import Comparison
 
 import reem
@@ -16,7 +16,6 @@ import reem.migration
 import reem.snapshots
 import reem_async
 from reem.server import EmbeddedCluster, EmbeddedServer
-from reem_async.plain.documents import MARK, TextDocument
 from reem_async.plain.translation import Known, directly, looked_at, translated
 from reem_async.store.catalog import names
 from reem_async.transport.protocol import error_of
@@ -32,25 +31,14 @@ def server():
 
 
 @pytest.fixture(scope="module")
+def server_url(server):
+    return server.url
+
+
+@pytest.fixture(scope="module")
 def raw(server):
-    """Another program's client of the plain server: it sees strings."""
     with redis.Redis(unix_socket_path=server.socket_path) as client:
         yield client
-
-
-@pytest.fixture(params=FRONTS)
-def open_front(request, server):
-    with contextlib.ExitStack() as stack:
-
-        def open_(space="KeyValueStore"):
-            return stack.enter_context(contextlib.closing(FRONTS[request.param](server.url, space)))
-
-        yield open_
-
-
-@pytest.fixture
-def front(open_front):
-    return open_front()
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +50,6 @@ def with_json():
 
 
 def calls(raw):
-    """How often each command was called, and refused, since the server began."""
     rows = raw.info("commandstats")
     return {name.removeprefix("cmdstat_"): row["calls"] + row["rejected_calls"] for name, row in rows.items()}
 
@@ -78,7 +65,6 @@ def text_of(raw, key):
 
 
 def check_no_orphans(raw, key):
-    """Arrays, registry and placeholders name each other exactly."""
     found = placeholders(orjson.loads(text_of(raw, key)))
     members = {member.decode() for member in raw.smembers(f"{{{key}}}:ships")}
     there = {name.decode().removeprefix(f"{{{key}}}") for name in raw.scan_iter(f"{{{key}}}*")} - {":ships", ":last"}
@@ -96,13 +82,6 @@ def test_generated_commands_are_answered_as_by_the_module(with_json, seed):
     comparison = Comparison(f"unix://{with_json.socket_path}", f"compared{seed}", seed)
     assert comparison.run(int(os.environ.get("REEM_TEST_EXAMPLES", "2000")) // 2) is None
     assert comparison.refused > 10
-
-
-def test_numbers_keep_every_bit():
-    document = TextDocument(MARK + b'{"u":18446744073709551615,"i":-9223372036854775808,"f":0.1}')
-    document.run(("JSON.SET", "k", '$["x"]', b"5e-324"))
-    document.run(("JSON.NUMINCRBY", "k", '$["f"]', b"0.2"))
-    assert orjson.loads(document.string()) == {"u": 2**64 - 1, "i": -(2**63), "f": 0.1 + 0.2, "x": 5e-324}
 
 
 # --- what is stored -------------------------------------------------
@@ -197,22 +176,21 @@ async def test_a_catalogue_tells_documents_from_strings(server, raw):
 # --- together with others -------------------------------------------------
 
 
-async def test_a_cancelled_change_is_done_once_or_not_at_all(server):
+async def test_a_cancelled_change_is_done_once_or_not_at_all(akvs):
     """Cancelled after any number of steps of the event loop; the next change finds nothing watched, nor half done."""
-    async with reem_async.RedisInterface(server) as interface:
-        it = reem_async.KeyValueStore(interface)["given_up"]
-        await it.write({"n": 0, "a": None})
-        for steps in range(40):
-            before = (await it["n"].read(), await it["a"].read())
-            task = asyncio.create_task(it.update({"n": steps + 1, "a": np.full(3, steps)}))
-            for _ in range(steps):
-                await asyncio.sleep(0)
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
-            after = await it.read()
-            assert after["n"] in (before[0], steps + 1)
-            assert_same(after["a"], np.full(3, steps) if after["n"] == steps + 1 else before[1])
+    it = akvs["given_up"]
+    await it.write({"n": 0, "a": None})
+    for steps in range(40):
+        before = (await it["n"].read(), await it["a"].read())
+        task = asyncio.create_task(it.update({"n": steps + 1, "a": np.full(3, steps)}))
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        after = await it.read()
+        assert after["n"] in (before[0], steps + 1)
+        assert_same(after["a"], np.full(3, steps) if after["n"] == steps + 1 else before[1])
 
 
 # --- a cluster, and servers of the other kind -------------------------------------------------
@@ -374,41 +352,43 @@ def test_a_look_that_is_redirected_is_an_answer_of_the_node():
     assert end.value.value == [moved]
 
 
-def test_a_large_text_is_written_though_somebody_was_first(server, raw, monkeypatch):
-    """It is not sent ahead: there is no key of its own for it to go to."""
+@pytest.mark.parametrize(
+    ("space", "value"), [("pspace", "x" * 100_000), ("kvs", np.arange(1 << 15))], ids=["text", "array"]
+)
+def test_what_is_large_is_written_though_somebody_was_first(request, kvs, raw, monkeypatch, space, value):
+    """An array is sent ahead and put in its place; a text is not: there is no key of its own for it to go to."""
     attempt, firsts = HeldText.attempt, []
 
-    async def overtaken(held, keys, commands, bulk):
+    async def overtaken(self, *batch):
         if not firsts:
-            firsts.append(commands)
+            firsts.append(batch)
             return None
-        return await attempt(held, keys, commands, bulk)
+        return await attempt(self, *batch)
 
-    with contextlib.closing(reem.RedisInterface(server)) as interface:
-        reem.KeyValueStore(interface)["text"] = {"n": 0}
-        monkeypatch.setattr(HeldText, "attempt", overtaken)
-        reem.PublishSpace(interface)["text"]["long"] = "x" * 100_000
-        monkeypatch.undo()
-        assert reem.KeyValueStore(interface)["text"].read() == {"n": 0, "long": "x" * 100_000}
-    assert len(firsts) == 1
+    kvs["large"] = {"n": 0}
+    monkeypatch.setattr(HeldText, "attempt", overtaken)
+    request.getfixturevalue(space)["large"]["it"] = value
+    assert firsts
+    assert_same(kvs["large"].read(), {"n": 0, "it": value})
+    assert not list(raw.scan_iter("*:staged:*"))
+    check_no_orphans(raw, "large")
 
 
-def test_what_somebody_nested_too_deep_is_refused_and_breaks_no_connection(server, raw):
+def test_what_somebody_nested_too_deep_is_refused_and_breaks_no_connection(interface, kvs, pspace, raw):
     """Followers, whose reads go over the connection of all, are told as of any value that cannot be read."""
     raw.set("deep", ' {"a":' + "[" * 300 + "]" * 300 + "}")
-    with contextlib.closing(reem.RedisInterface(server)) as interface:
-        kvs, states = reem.KeyValueStore(interface), []
-        interface.on_state(states.append)
-        kvs["beside"] = 1
-        with reem.SilentSubscriber("beside", interface) as beside:
-            for call in (lambda: kvs["deep"]["a"].read(), lambda: kvs["deep"]["b"].write(1)):
-                with pytest.raises(redis.ResponseError, match="nested over"):
-                    call()
-            with contextlib.suppress(redis.ResponseError, reem.ReemError), reem.SilentSubscriber("deep.a", interface):
-                pass
-            reem.PublishSpace(interface)["beside"] = 2
-            eventually(lambda: beside.value() == 2)
-        assert [each for each in states if "lost" in str(each)] == []
+    states = []
+    interface.on_state(states.append)
+    kvs["beside"] = 1
+    with reem.SilentSubscriber("beside", interface) as beside:
+        for call in (lambda: kvs["deep"]["a"].read(), lambda: kvs["deep"]["b"].write(1)):
+            with pytest.raises(redis.ResponseError, match="nested over"):
+                call()
+        with contextlib.suppress(redis.ResponseError, reem.ReemError), reem.SilentSubscriber("deep.a", interface):
+            pass
+        pspace["beside"] = 2
+        eventually(lambda: beside.value() == 2)
+    assert [each for each in states if "lost" in str(each)] == []
 
 
 def test_whether_there_must_be_a_look_is_decided_once():
@@ -419,27 +399,6 @@ def test_whether_there_must_be_a_look_is_decided_once():
     assert looked_at(commands, known) == []
     known.saw(b"k", False)  # or its time is over
     assert [command[0] for command in next(directly(commands, known, error_of))] == ["MULTI", "SET", "PUBLISH", "EXEC"]
-
-
-def test_what_is_sent_ahead_is_put_in_place(server, raw, monkeypatch):
-    """Somebody else is first once, for certain."""
-    attempt, firsts = HeldText.attempt, []
-
-    async def late(self, *batch):
-        if not firsts:
-            firsts.append(batch)
-            return None
-        return await attempt(self, *batch)
-
-    with contextlib.closing(reem.RedisInterface(server)) as interface:
-        store = reem.KeyValueStore(interface)
-        store["ahead"] = {"n": 0}
-        monkeypatch.setattr(HeldText, "attempt", late)
-        store["ahead"]["image"] = np.arange(1 << 15)
-        assert firsts
-        assert_same(store["ahead"].read(), {"n": 0, "image": np.arange(1 << 15)})
-        assert not list(raw.scan_iter("*:staged:*"))
-    check_no_orphans(raw, "ahead")
 
 
 def test_a_question_about_the_commands_of_the_server_is_asked():

@@ -45,8 +45,6 @@ def program(url, code=PROGRAM):
 
 
 class Events:
-    """The events of a watch of either front, with a time limit for the next one."""
-
     def __init__(self, front, interface):
         self.front, self.watch = front, interface.watch_nodes()
         front.wait(self.watch.listen())
@@ -235,7 +233,6 @@ def test_nodes_of_several_servers(kind, request):
 
 
 async def test_many_nodes(server):
-    """In one program, each with an interface of its own."""
     async with contextlib.AsyncExitStack() as stack:
         watcher = await stack.enter_async_context(reem_async.RedisInterface(server))
         watch = await stack.enter_async_context(watcher.watch_nodes())

@@ -37,7 +37,6 @@ NOT_FINITE = [
 
 
 def nested(levels, beside, ahead):
-    """As many levels, in each of which there is something flat besides, ahead of the next level or behind it."""
     value = 1
     for level in range(levels):
         if level % 2:
@@ -199,7 +198,6 @@ def test_a_buffer_that_is_not_flat_bytes_is_never_sent():
 
 
 def encoded(value):
-    """Return a value in the protocol."""
     if value is None:
         return b"_\r\n"
     if isinstance(value, bool):

@@ -136,8 +136,6 @@ PATTERNS = pytest.mark.parametrize(
 
 @PATTERNS
 async def test_a_slot_that_moves(cluster, file, patterns):
-    """The last of the keys, slowly, and away from who else is recorded."""
-
     async def moved():
         move = await asyncio.to_thread(lambda: Move(cluster, NAMES[-1]).begin())
         while keys := await asyncio.to_thread(move.all_keys):

@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 import os
 import random
 import signal
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 from conftest import assert_same, eventually, python, sized
 from test_recording import IMAGE
-from test_recording_layout import RawImage
 
 import reem
 import reem.recording
@@ -146,47 +144,6 @@ def test_arrivals_do_not_tell_that_updates_were_taken_together():
         set_back = arrivals.of("p", 90.0, 102.0)
         assert 101.996 <= set_back <= 102.0
         assert arrivals.of("q", 200.0, 103.0) == 103.0
-
-
-@pytest.mark.long
-def test_the_library_s_own_reader_and_foxglove_s_classes(names, file_and_values):
-    file, seen = file_and_values
-    with file.open("rb") as stream:
-        reader = mcap.reader.make_reader(stream, validate_crcs=True)
-        summary = reader.get_summary()
-        assert len(summary.chunk_indexes) > 5
-        assert summary.statistics.message_count == sum(summary.statistics.channel_message_counts.values())
-        images, documents = [], []
-        topics = set()
-        for schema, channel, message in reader.iter_messages():
-            assert schema is not None, "every channel has a schema: some viewers skip those without"
-            assert channel.metadata["reem.version"] == "1"
-            topics.add(channel.topic)
-            if channel.topic == f"/{names('a')}/image":
-                assert (schema.name, schema.encoding, channel.message_encoding) == (
-                    "foxglove.RawImage",
-                    "protobuf",
-                    "protobuf",
-                )
-                images.append(RawImage.FromString(message.data))
-            elif channel.topic == f"/{names('a')}":
-                assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
-                assert json.loads(schema.data)["properties"]["n"] == {"type": "number"}
-                documents.append((message, json.loads(message.data)))
-        assert topics == {f"/{names('a')}", f"/{names('a')}/image", f"/{names('b')}", "/_reem/keyframe"}
-        assert len(images) == len(documents) == len(seen)
-        for image, (message, document), (_, value) in zip(images, documents, seen, strict=True):
-            assert document["n"] == value["n"]
-            assert (image.width, image.height, image.encoding, image.step) == (64, 48, "rgb8", 192)
-            assert image.data == value["image"].tobytes()
-            assert document["image"]["topic"] == f"/{names('a')}/image"
-            assert message.sequence == value["n"] + 1
-            assert abs(message.publish_time - message.log_time) < 10**9
-            assert image.timestamp.seconds == message.publish_time // 10**9
-        names = {record.name for record in reader.iter_metadata()}
-        assert names == {"reem", "reem.channels"}
-    with file.open("rb") as stream:  # and record by record, every checksum verified
-        assert list(mcap.reader.NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False))
 
 
 def test_metadata_says_who_when_and_what_is_missing(names, file_and_values):

@@ -13,7 +13,7 @@ import pytest
 from conftest import assert_same
 from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import example, given, settings
-from test_values import arrays, mixed
+from test_values import mixed
 
 from reem_async.errors import BadData, BadInput, BadValue
 from reem_async.plan.paths import parse_pattern
@@ -66,12 +66,6 @@ def there_and_back(value):
 @given(value=mixed)
 def test_any_tree_comes_back_equal(value):
     assert_same(there_and_back(value), value)
-
-
-@settings(max_examples=100, deadline=None)
-@given(array=arrays)
-def test_any_array_comes_back_equal(array):
-    assert_same(there_and_back({"a": [array]}), {"a": [array]})
 
 
 @pytest.mark.parametrize(

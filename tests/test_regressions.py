@@ -1,7 +1,6 @@
 """Defects that a review found, one test for each: the store, connections, and ships."""
 
 import asyncio
-import contextlib
 import enum
 import operator
 import secrets
@@ -101,7 +100,6 @@ class Name(str, enum.Enum):  # noqa: UP042 - the older way is what people have
 
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
 def test_a_str_enum_is_refused_as_a_key(open_front, key, raw, space):
-    """As an element of a path and as a top-level key: two names for one place would be a trap."""
     front = open_front(space)
     front.write([key()], {"aa": 0})
     with nothing_sent(raw):
@@ -113,8 +111,6 @@ def test_a_str_enum_is_refused_as_a_key(open_front, key, raw, space):
 
 
 class Tag(str):
-    """Shows itself in brackets."""
-
     __slots__ = ()
 
     def __str__(self):
@@ -140,19 +136,10 @@ def test_the_empty_path_is_refused_as_a_bad_key(front):
 # --- connections ----------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def silence():
-    """A server that accepts and never answers; yields its port."""
-    with socket.socket() as listening:
-        listening.bind(("127.0.0.1", 0))
-        listening.listen(8)
-        yield listening.getsockname()[1]
-
-
 @pytest.mark.alone
 async def test_a_server_that_accepts_and_never_answers_is_given_up():
-    """In both fronts, for reading and for following."""
-    with silence() as port:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
         start = time.monotonic()
         direct, followers = reem.RedisInterface("127.0.0.1", port=port), reem.RedisInterface("127.0.0.1", port=port)
         core = reem_async.RedisInterface("127.0.0.1", port=port)
@@ -174,7 +161,6 @@ async def test_a_server_that_accepts_and_never_answers_is_given_up():
 
 
 def connections(raw):
-    """The ids of all connections but the one that asks."""
     return {row["id"] for row in raw.client_list()} - {str(raw.client_id())}
 
 
@@ -199,8 +185,6 @@ async def test_an_edit_works_after_its_connection_was_killed_while_it_lay_idle(s
 
 
 class Slow(reem_async.SpecialDatatypeShip):
-    """Has to wait for everything."""
-
     def __init__(self, kind, label):
         self.kind, self.label = kind, label
 
@@ -286,7 +270,6 @@ def test_a_foreign_type_under_a_ships_key_is_bad_data_with_the_path(open_front, 
 
 
 def test_a_publish_from_another_event_loop_is_refused_though_one_is_under_way(server_url, key):
-    """And the loop that owns the interface goes on."""
     pspace = reem_async.PublishSpace(reem_async.RedisInterface(server_url))
     refused, begun, enough = [], threading.Event(), threading.Event()
 

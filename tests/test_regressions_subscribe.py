@@ -18,7 +18,6 @@ from reem_async.errors import BadType, InterfaceClosed, PathRefused
 
 
 async def waiting(awaitable):
-    """The result, or a failure in place of waiting for ever."""
     return await asyncio.wait_for(awaitable, PATIENCE)
 
 
@@ -289,8 +288,6 @@ async def test_a_callback_subscriber_whose_queue_overflows_says_that_it_ends(ser
 
 
 def test_a_coroutine_function_is_refused_as_a_callback_of_the_blocking_front(interface, key):
-    """It would never run."""
-
     async def callback(data, updated_path):
         pass
 

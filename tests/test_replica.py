@@ -127,7 +127,6 @@ class Model:
         return [] if found is MISSING else list(leaves(found, path))
 
     def run(self, plan):
-        """The replies to a plan's commands."""
         replies = [self.reply(command) for command in plan.commands]
         return [b"OK", *[b"QUEUED"] * len(replies), replies] if plan.atomic else replies
 
@@ -151,7 +150,6 @@ class Model:
 
 
 def leaves(tree, path):
-    """Where there are bytes in a tree."""
     if isinstance(tree, bytes):
         yield path
     for key, child in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():

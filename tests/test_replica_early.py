@@ -60,7 +60,6 @@ class EarlyWorld(World):
 
     @property
     def ends(self):
-        """Whether this is the last phase, in which nothing goes wrong any more."""
         return self.faults is not self.begun_with
 
     def step(self):

@@ -54,7 +54,6 @@ class Rights:
         return {each for each in self.all if each in found or each[0] in "~&"}
 
     def log_in(self):
-        """Return an interface of the user, which connects once it is used."""
         return reem_async.RedisInterface(self.host, namespace="robot1:", username="robot", password="pw")
 
     def note(self, name):

@@ -60,7 +60,6 @@ def other_authority(tmp_path_factory):
 
 
 def context_for(certificate, ca=None):
-    """A server's TLS settings; with `ca`, clients have to show a certificate of that authority."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(*certificate)
     if ca is not None:
@@ -90,7 +89,6 @@ def guarded(behind_tls):
 
 @pytest.fixture(scope="module")
 def shielded(behind_tls):
-    """A server that does not ask for certificates; yields its port."""
     with behind_tls() as port:
         yield port
 

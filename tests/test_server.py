@@ -79,15 +79,6 @@ def wrapped(tmp_path):
 
 
 class TestUse:
-    def test_serves_json_on_the_port_and_on_the_socket(self):
-        with EmbeddedServer() as server:
-            assert server.url == f"redis://127.0.0.1:{server.port}"
-            with client(server) as c:
-                assert c.execute_command("JSON.SET", "a", "$", '{"b": [1, 2.5]}')
-            with redis.Redis(unix_socket_path=server.socket_path) as c:
-                assert c.execute_command("JSON.GET", "a", "$.b") == b"[[1,2.5]]"
-                assert c.info()["process_id"] == server.pid
-
     async def test_async_enter_and_exit_leave_the_loop_running(self):
         longest = 0.0
 
@@ -173,12 +164,6 @@ class TestUse:
         server.start()
         assert server.running
         server.stop()
-
-    def test_nothing_is_left_in_the_temporary_directory(self):
-        with EmbeddedServer() as server:
-            folder = server.directory
-            assert folder == pathlib.Path(server.socket_path).parent
-        assert not folder.exists()
 
     def test_a_long_temporary_directory_does_not_break_the_socket(self, tmp_path):
         deep = tmp_path / ("d" * 100)
@@ -504,7 +489,6 @@ class TestEnd:
     )
     MORE_ENDS = (
         "server.stop(); server.stop()",
-        "del server",
         "with server: pass",
         "threading.Thread(target=sys.exit).start()",
         "t = threading.Thread(target=server.stop); t.start()",
@@ -572,8 +556,6 @@ class TestEnd:
 
 
 class TestPrograms:
-    """Each in a process of its own: the choice depends on the environment and is remembered."""
-
     SHOW = """
         from reem_async.server import EmbeddedServer
         from reem_async.errors import ReemError

@@ -17,14 +17,12 @@ both = pytest.mark.parametrize("name", list(FRONTS))
 
 @pytest.fixture(scope="module")
 def server():
-    """A private server; each test puts back what it changes."""
     with own_server() as process:
         yield process
 
 
 @pytest.fixture
 def admin(server):
-    """The administrator, who finds an empty server and leaves one."""
     with server.admin() as client:
         yield client
         client.config_set("maxmemory", 0)
@@ -162,8 +160,6 @@ def test_a_refused_login_is_told_at_once_and_not_tried_again(locked, name, optio
 
 @pytest.fixture
 def robot(server, admin):
-    """Makes the user `robot` with the given rules; returns the address to log in by."""
-
     def make(*rules):
         admin.execute_command("ACL", "SETUSER", "robot", "reset", "on", ">secret", *rules)
         return server.url.replace("//", "//robot:secret@")

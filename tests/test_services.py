@@ -65,8 +65,6 @@ VALUES = {
 
 
 def served(front, place, function, **options):
-    """Begin to serve; for asyncio, inside of its event loop."""
-
     async def begin():
         service = place.serve(function, **options)
         await service.listen()
@@ -395,7 +393,6 @@ async def test_a_service_that_is_closed_while_it_begins_does_not_serve(akvs, key
 
 @pytest.fixture(params=["auto", "early"])
 def caller(request, server_url):
-    """What calls through the server, or directly."""
     with reem.RedisInterface(server_url, local=request.param) as interface:
         yield reem.KeyValueStore(interface)
 

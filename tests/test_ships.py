@@ -18,8 +18,6 @@ from reem_async.ships import NumpyShip, SpecialDatatypeShip
 
 
 class Pose:
-    """What robots have; no JSON type, no array."""
-
     def __init__(self, x, y, frame="map"):
         self.x, self.y, self.frame = x, y, frame
 
@@ -235,8 +233,6 @@ def test_a_ship_that_fails_to_write_sends_nothing(open_front, key, raw):
 
 
 def test_a_ship_may_return_falsy_values(open_front, key):
-    """None or an empty thing from interpret_read is a value."""
-
     class Nothing(PoseShip):
         def interpret_read(self, responses):
             return None

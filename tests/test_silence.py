@@ -36,7 +36,6 @@ def publish_late(raw, key, value, late, number):
 
 
 def idle(front, seconds):
-    """Let time pass, in which the event loop of the test goes on."""
     front.wait(asyncio.sleep(seconds)) if hasattr(front, "runner") else time.sleep(seconds)
 
 
@@ -56,10 +55,8 @@ def limited(front, call):
 @pytest.fixture
 def mirror(front, key):
     made = front.at((key(),)).mirror(ttl=TTL)
-    with contextlib.ExitStack() as stack:
-        front.wait(made.listen())
-        stack.callback(lambda: front.wait(made.close()))
-        yield made
+    front.wait(made.listen())
+    return made
 
 
 def test_a_mirror_relies_on_what_is_published_for_so_long(front, mirror, key, kvs, pspace):

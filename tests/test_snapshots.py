@@ -11,7 +11,6 @@ import redis
 import snapshotkit
 from conftest import PLAIN, aeventually, assert_no_orphans, assert_same, commands_run, repeated
 from snapshotkit import everything, hard_floats, left_in
-from test_ships import Pose, PoseShip
 
 import reem
 import reem.snapshots
@@ -47,12 +46,6 @@ async def test_the_servers_own_text_would_not_do(raws):
                 again = float.fromhex(again.removeprefix("$ship float "))
             assert struct.pack("<d", again) == struct.pack("<d", value)
     assert inline < 400, "those that no text carries are few"
-
-
-async def test_an_empty_server_gives_an_empty_snapshot(here, there, raws, tmp_path):
-    assert (await save(here, tmp_path / "a.zip")).count == 0
-    assert (await restore(there, tmp_path / "a.zip")).names == ()
-    assert everything(raws[1]) == {}
 
 
 class Stored:
@@ -145,17 +138,6 @@ async def test_a_key_that_expires_is_restored_with_the_time_it_had_left(here, th
         assert 80_000 < raws[1].pttl(name) <= 100_000
     for name in ("stays", "{stays}.a", "{stays}:ships"):
         assert raws[1].pttl(name) == -1
-
-
-async def test_a_custom_ship_reads_what_was_restored(servers, raws, tmp_path):
-    ships = [reem.NumpyShip(), PoseShip()]
-    async with reem_async.RedisInterface(servers[0], ships=ships) as here:
-        await reem_async.KeyValueStore(here)["robot"].write({"at": Pose(1.5, 2.5), "path": [Pose(0, 0), np.arange(2)]})
-        await save(here, tmp_path / "a.zip")
-    async with reem_async.RedisInterface(servers[1], ships=ships) as there:
-        await restore(there, tmp_path / "a.zip")
-        got = await reem_async.KeyValueStore(there)["robot"].read()
-    assert (got["at"], got["path"][0]) == (Pose(1.5, 2.5), Pose(0.0, 0.0))
 
 
 # --- which keys -------------------------------------------------

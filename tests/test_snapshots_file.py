@@ -146,20 +146,6 @@ async def test_a_file_that_is_there_is_not_overwritten_unasked(here, raws, tmp_p
     assert (await describe(tmp_path / "a.zip")).count == 0
 
 
-async def test_a_file_that_somebody_makes_meanwhile_is_not_overwritten_unasked(here, raws, tmp_path, monkeypatch):
-    """The look at the beginning did not see it, and both were told that they had saved."""
-    await reem_async.KeyValueStore(here)["foo"].write(1)
-
-    def meanwhile(_):
-        (tmp_path / "a.zip").write_text("precious")
-
-    with pytest.raises(FileExistsError, match="overwrite=True"):
-        await save(here, tmp_path / "a.zip", progress=meanwhile)
-    assert (tmp_path / "a.zip").read_text() == "precious"
-    await save(here, tmp_path / "a.zip", overwrite=True, progress=meanwhile)
-    assert (await describe(tmp_path / "a.zip")).count == 1
-
-
 async def test_cancelled_or_failed_it_leaves_no_file(here, raws, tmp_path):
     kvs = reem_async.KeyValueStore(here)
     for number in range(30):

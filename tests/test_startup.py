@@ -43,7 +43,6 @@ def cluster_port():
     "kind", ["one server", *[pytest.param(it, marks=pytest.mark.long) for it in ("cluster", "sentinel")]]
 )
 def test_the_first_call_waits_for_the_server(name, kind, request):
-    """Whichever call is the first, and however often it needs the server."""
     if kind == "sentinel":
         target, url = request.getfixturevalue("watched").ports[0], "redis+sentinel://127.0.0.1:{}/mymaster"
     elif kind == "cluster":

@@ -14,7 +14,6 @@ from reem_async.transport.state import States
 
 
 def ends(work):
-    """Whether `work` ends, and well, on another thread."""
     ended = threading.Event()
     threading.Thread(target=lambda: (work(), ended.set()), daemon=True).start()
     return ended.wait(5)
@@ -81,7 +80,6 @@ def test_a_change_that_a_callback_makes_is_told_behind_the_one_it_was_called_wit
 
 
 def in_child(work):
-    """Whether `work` ends, and well, in a forked child."""
     pid = os.fork()
     if not pid:
         # On the thread that has forked: a new one may pass for the one that is gone, and have its locks.

@@ -24,7 +24,6 @@ from reem_async.transport.protocol import CommandRecorder
 
 
 async def test_edit_writes_back_what_the_block_changed(akvs, key, raw):
-    """Also arrays, which are writable copies inside the block."""
     await akvs[key()].write({"n": 1, "image": np.zeros(3), "gone": np.ones(2)})
     async with akvs[key()].edit() as value:
         value["n"] += 1
@@ -56,7 +55,6 @@ async def test_an_edit_that_somebody_overtook_is_a_conflict(akvs, kvs, key, imag
 
 
 async def test_a_cancelled_call_harms_no_other(akvs, key):
-    """Its reply is dropped, not handed to the next caller."""
     await akvs[key()].write({str(n): n for n in range(50)} | {"image": np.zeros(100_000)})
     for _ in range(20):
         tasks = [asyncio.create_task(akvs[key()][str(n)].read()) for n in range(50)]
@@ -71,7 +69,6 @@ async def test_a_cancelled_call_harms_no_other(akvs, key):
 
 
 def test_handles_can_be_pickled(open_front, key):
-    """Stores, accessors, publish spaces and interfaces reconnect."""
     front, space = open_front(), open_front("PublishSpace")
     front.write([key()], {"a": np.arange(3)})
     store, accessor = pickle.loads(pickle.dumps((front.kvs, front.at([key(), "a"]))))

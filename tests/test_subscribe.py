@@ -1,7 +1,6 @@
 """Subscribing in `reem_async`: what depends on tasks and event loops. `test_following.py` has what both fronts do."""
 
 import asyncio
-import contextlib
 
 import numpy as np
 import pytest
@@ -11,12 +10,11 @@ import reem
 from reem_async import CallbackSubscriber, Every, KeyValueStore, Last, PublishSpace
 from reem_async import SilentSubscriber as Mirror
 from reem_async.concurrency.queues import EMPTY
-from reem_async.errors import InterfaceClosed, MissingKey
+from reem_async.errors import MissingKey
 from reem_async.pubsub.manager import manager_of
 
 
 async def following(updates):
-    """The next update, or a failure in place of waiting for ever."""
     return await asyncio.wait_for(anext(updates), PATIENCE)
 
 
@@ -146,23 +144,7 @@ async def test_what_was_there_before_is_no_loss(ainterface, binterface, key):
         assert updates.queue.take() is EMPTY
 
 
-async def test_a_callback_may_use_reem(ainterface, akvs, apspace, key):
-    """Read, write and publish on the very interface that called it."""
-
-    async def process(data, updated_path):
-        count = await akvs[key("count")].get(0)
-        await akvs[key("count")].write(count + 1)
-        await apspace[key("out")].write({"twice": data["n"] * 2})
-
-    async with CallbackSubscriber(key("in"), ainterface, process, {}), Mirror(key("out"), ainterface) as out:
-        for n in range(1, 4):
-            await apspace[key("in")].write({"n": n})
-            await aeventually(lambda n=n: out.value() == {"twice": 2 * n})
-    assert await akvs[key("count")].read() == 3
-
-
 async def test_updates_of_one_publisher_arrive_in_order_and_once(akvs, apspace, key, binterface):
-    """Of two publishers each one's own, with growing sequence numbers."""
     await akvs[key()].write({"a": -1, "b": -1})
     updates = akvs[key()].watch(policy=Every(1000))
     await following(updates)
@@ -203,7 +185,6 @@ async def test_an_update_that_the_server_applied_late_comes_late_and_once(akvs, 
 
 
 async def test_a_cancelled_wait_swallows_no_update(akvs, apspace, key):
-    """The next one is there for the next wait."""
     await akvs[key()].write(-1)
     updates = akvs[key()].watch()
     await following(updates)
@@ -214,25 +195,6 @@ async def test_a_cancelled_wait_swallows_no_update(akvs, apspace, key):
         await asyncio.gather(waiting, return_exceptions=True)
         await apspace[key()].write(n)
         assert (await following(updates)).data == n
-
-
-async def test_a_closed_subscriber_follows_no_more(ainterface, akvs, apspace, key):
-    """The others on the same channel do; closing twice is fine."""
-    heard = []
-    one, other = Mirror(key(), ainterface), Mirror(key(), ainterface)
-    calls = CallbackSubscriber(key(), ainterface, lambda data, updated_path: heard.append(data), {})
-    for subscriber in (one, other, calls):
-        await subscriber.listen()
-    await apspace[key()].write(1)
-    await aeventually(lambda: heard == [1] and one.value() == other.value() == 1)
-    await one.close()
-    await calls.close()
-    await calls.close()
-    await apspace[key()].write(2)
-    await aeventually(lambda: other.value() == 2)
-    assert heard == [1]
-    with contextlib.suppress(InterfaceClosed):
-        assert one.value() == 1
 
 
 def test_a_deletion_at_any_index_is_a_notice_that_can_be_read(interface, pspace, key):

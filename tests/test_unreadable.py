@@ -28,8 +28,6 @@ IMAGES = {"small": np.arange(100), "large": np.arange(100_000)}
 
 
 class Pose(BlobShip):
-    """A ship that followers lack."""
-
     def check_fit(self, value):
         return isinstance(value, complex)
 
@@ -129,7 +127,6 @@ class Followers:
 
 
 def beside(tree):
-    """What there is beside the image."""
     return {key: value for key, value in tree.items() if key != "image"} if isinstance(tree, dict) else tree
 
 

@@ -175,7 +175,6 @@ def test_arrays_keep_dtype_shape_and_every_bit(front, key, raw, name):
 
 
 def test_arrays_read_are_read_only(front, key):
-    """A copy is one call away; what is shared with the reply buffer is not silently changed."""
     front.write([key()], np.arange(3))
     with pytest.raises(ValueError, match="read-only"):
         front.read([key()])[0] = 5
@@ -206,7 +205,6 @@ def test_strings_that_look_like_placeholders_are_strings(front, key, raw):
 
 
 def test_a_document_of_a_hundred_levels_is_held(front, key):
-    """The promised depth, as lists and as dicts."""
     nested, named = 1, 1
     for _ in range(100):
         nested, named = [nested], {"d": named}
@@ -216,7 +214,6 @@ def test_a_document_of_a_hundred_levels_is_held(front, key):
 
 
 def test_the_document_is_readable_in_redis_cli(front, key, raw):
-    """JSON.GET shows the plain values as they are, and what each array is."""
     front.write([key()], {"stamp": 12, "image": np.zeros((4, 5, 3), np.uint8), "blob": b"1234567"})
     text = raw.execute_command("JSON.GET", key())
     assert '"stamp":12' in text

@@ -29,7 +29,6 @@ from reem_async.store import outage, send_queue
 
 @pytest.fixture(params=list(FRONTS))
 def publisher(request, server_url, key):
-    """Makes either front with a PublishSpace that does not wait."""
     with contextlib.ExitStack() as stack:
 
         def make(url=server_url, policy="raise", on_error=None, **options):

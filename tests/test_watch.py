@@ -2,13 +2,14 @@
 
 import asyncio
 import contextlib
+import functools
 import logging
 
 import numpy as np
 import pytest
+from chaos.servers import PrivateServer
 from clusterkit import Move, clients_of
 from conftest import FRONTS, PATIENCE, Loop, RawCluster, aeventually, assert_same, commands_run
-from own_servers import Configured, free_port, program
 
 import reem
 import reem_async
@@ -22,12 +23,7 @@ IMAGE = np.arange(10_000, dtype=np.float64).reshape(100, 100)
 
 @pytest.fixture
 def watching(front):
-    with contextlib.ExitStack() as stack:
-
-        def begin(path, **options):
-            return stack.enter_context(contextlib.closing(watched(front, path, **options)))
-
-        yield begin
+    return functools.partial(watched, front)
 
 
 def watched(front, path, **options):
@@ -35,7 +31,6 @@ def watched(front, path, **options):
 
 
 def test_what_anybody_stores_is_told_as_what_it_led_to(front, watching, raw, kvs, key):
-    """With the deepest place that holds all that differs."""
     top = key()
     front.write((top,), {"a": 1, "b": {"c": 2, "d": 3}, "l": [1, 2, 3]})
     watch = watching((top,))
@@ -166,7 +161,6 @@ def test_an_array_that_is_all_of_a_key_is_told_when_it_is_written_again(watching
 
 
 def test_what_a_neighbour_with_a_longer_name_stores_is_not_told(watching, kvs, key):
-    """`foobar` beside `foo`, and a key with a dot."""
     kvs[key()] = 1
     watch = watching((key(),))
     watch.next()
@@ -185,7 +179,6 @@ def test_a_watch_of_published_updates_alone_does_not_hear_stores(watching, kvs, 
 
 
 def test_subscribers_hear_what_is_published_and_all_if_asked(interface, kvs, pspace, key):
-    """As the manual says, and with `stored=True` every change."""
     heard = []
     with (
         reem.SilentSubscriber(key(), interface) as published,
@@ -224,30 +217,22 @@ def test_who_may_not_track_hears_what_is_published_and_is_warned_once(kind, capl
         assert "client|tracking" in warning
 
 
-def test_a_restart_without_data_is_told_as_a_gap_and_that_all_is_gone():
+async def test_a_restart_without_data_is_told_as_a_gap_and_that_all_is_gone():
     """Not as a value that looks as if somebody had stored None."""
-
-    async def live():
-        port = free_port()
-        server = Configured(program(), [], port=port)
-        try:
-            async with reem_async.RedisInterface(server.url) as interface:
-                kvs = reem_async.KeyValueStore(interface)
-                await kvs["foo"].write({"a": 1})
-                watch = kvs["foo"]["a"].watch(Every(100))
-                assert (await anext(watch)).value == 1
-                server.stop()
-                server = Configured(program(), [], port=port)
-                update = await asyncio.wait_for(anext(watch), PATIENCE)
-                assert (update.gap, update.deleted, update.value, update.data) == (True, True, None, None)
-                assert update.origin == "found"
-                await kvs["foo"].write({"a": 2})
-                update = await asyncio.wait_for(anext(watch), PATIENCE)
-                assert (update.origin, update.value, update.gap) == ("stored", 2, False)
-        finally:
-            server.stop()
-
-    asyncio.run(live())
+    with PrivateServer() as server:
+        async with reem_async.RedisInterface(server.url) as interface:
+            kvs = reem_async.KeyValueStore(interface)
+            await kvs["foo"].write({"a": 1})
+            watch = kvs["foo"]["a"].watch(Every(100))
+            assert (await anext(watch)).value == 1
+            server.kill()
+            server.start()
+            update = await asyncio.wait_for(anext(watch), PATIENCE)
+            assert (update.gap, update.deleted, update.value, update.data) == (True, True, None, None)
+            assert update.origin == "found"
+            await kvs["foo"].write({"a": 2})
+            update = await asyncio.wait_for(anext(watch), PATIENCE)
+            assert (update.origin, update.value, update.gap) == ("stored", 2, False)
 
 
 def test_a_flushed_server_is_told_by_everybody_who_watches():

@@ -1,7 +1,6 @@
 """`kvs.watch("robot1.*")`: every change of all keys that patterns name, those that come to be and those that go."""
 
 import asyncio
-import contextlib
 
 import numpy as np
 import pytest
@@ -22,13 +21,7 @@ IMAGE = np.zeros((480, 640, 3), np.uint8)
 
 @pytest.fixture
 def watching(front):
-    with contextlib.ExitStack() as stack:
-
-        def begin(*patterns, **options):
-            watch = front.kvs.watch(*patterns, policy=Last(10_000), **options)
-            return stack.enter_context(contextlib.closing(Loop(front, watch)))
-
-        yield begin
+    return lambda *patterns: Loop(front, front.kvs.watch(*patterns, policy=Last(10_000)))
 
 
 def test_all_keys_of_a_pattern_are_told_first_and_then_what_changes(watching, kvs, pspace, key):
@@ -140,7 +133,6 @@ def test_what_is_no_pattern_is_refused_and_so_is_a_publish_space(front, pspace):
 
 
 async def test_a_watch_that_is_dropped_or_closed_leaves_nothing_behind(ainterface, akvs, key):
-    """Nor does one of which the interface is closed."""
     await akvs[key("a")].write(1)
     watch = akvs.watch(key("*"))
     await watch.listen()
@@ -178,7 +170,6 @@ async def test_documents_that_no_key_can_have_are_left_out(server_url, key, raw)
 
 
 async def test_a_look_for_keys_that_the_server_refuses_is_made_again(akvs, key, monkeypatch):
-    """Whatever error it answers with: the watch goes on."""
     async with akvs.watch(key("*")) as watch:
         with monkeypatch.context() as patched:
             patched.setattr(key_plans, "_PAGE", "none")  # "ERR value is not an integer"

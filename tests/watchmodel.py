@@ -54,7 +54,6 @@ def value(rng: random.Random, place: tuple) -> object:
 
 
 def change(space: object, rng: random.Random) -> None:
-    """Change something through a store or a publish space of the blocking front."""
     place, kind = rng.choice(PLACES), rng.random()
     handle = space[rng.choice(KEYS)]
     for key in place:
@@ -70,7 +69,6 @@ def change(space: object, rng: random.Random) -> None:
 
 
 async def achange(space: object, rng: random.Random) -> None:
-    """Change something through a store or a publish space of the asyncio front."""
     place = rng.choice(PLACES)
     handle = space[rng.choice(KEYS)]
     for key in place:
@@ -134,8 +132,6 @@ def write(url: str, kind: str, seed: int) -> None:
 
 
 class Last:
-    """What a watcher was told last, by place."""
-
     def __init__(self, name: str) -> None:
         self.name = name
         self.data: dict[str, object] = {}

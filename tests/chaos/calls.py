@@ -26,7 +26,6 @@ TOP = "storm"
 
 
 def tagged(number: int, array: Any = None) -> dict[str, Any]:
-    """A value that shows in every part whose it is."""
     return {"id": number, "array": np.full(8, number) if array is None else array, "text": str(number)}
 
 
@@ -171,7 +170,6 @@ class _Losses:
         self.wrong: list[Any] = []
 
     def outcome(self, place: str, token: str, error: BaseException | None) -> None:
-        """Note how a call ended."""
         if error is None:
             self.known[place][token] += 1
         elif isinstance(error, reem.ConnectionLost):
@@ -180,7 +178,6 @@ class _Losses:
             self.wrong.append(error)
 
     def lose(self, marker: bytes) -> None:
-        """Lose the reply to the next request with `marker`."""
         self._proxy.drop_reply(marker)
 
     def unexplained(self, backward: list[Any]) -> list[Any]:

@@ -15,8 +15,6 @@ CHUNK = 1 << 16
 
 
 class _Link:
-    """One client's connection and the one made to the server for it."""
-
     def __init__(self, client: asyncio.StreamWriter, server: asyncio.StreamWriter) -> None:
         self.client = client
         self.server = server
@@ -40,6 +38,7 @@ class Proxy:
         port: Where it listens, on 127.0.0.1; a free one if none is given.
         connections: How many there were.
         delay: Seconds by which each chunk, either way, is held back.
+        left: How many bytes it still hands to the server before it resets all connections, for good.
         lost: How many replies were dropped.
     """
 
@@ -51,6 +50,7 @@ class Proxy:
         self.port = port
         self.connections = 0
         self.delay = 0.0
+        self.left: int | None = None
         self.lost = 0
         self._marker: bytes | None = None
         self._hole = False
@@ -154,6 +154,9 @@ class Proxy:
         await asyncio.sleep(0.01)  # for the connections that were just aborted to be closed
 
     async def _link(self, reader: asyncio.StreamReader, client: asyncio.StreamWriter) -> None:
+        if self.left == 0:
+            _abort(client)
+            return
         connecting = asyncio.ensure_future(asyncio.open_connection("127.0.0.1", self._target))
         try:
             replies, server = await asyncio.shield(connecting)
@@ -189,8 +192,14 @@ class Proxy:
                 if marker in tail + data:
                     self._marker, link.doomed = None, True
                 tail = data[-len(marker) :]
+            if self.left is not None:
+                data = data[: self.left]
+                self.left -= len(data)
             if not link.swallowed:
                 await self._forward(data, link.server)
+            if self.left == 0:
+                for each in list(self._links):
+                    each.reset()
         link.gone = True
         with contextlib.suppress(OSError, RuntimeError):
             link.server.write_eof()

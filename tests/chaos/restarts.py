@@ -50,8 +50,6 @@ class _Writer:
 
 
 class _Follower:
-    """A subscriber: its copy, and the log of what it was told."""
-
     def __init__(self, interface: reem_async.RedisInterface) -> None:
         self.mirror = reem_async.SilentSubscriber(TOP, interface)
         self.log = Log(self.mirror.watch(Last(1_000_000)))

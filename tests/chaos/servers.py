@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import os
-import random
 import shutil
 import signal
-import socket
 import tempfile
 import time
 from pathlib import Path
 
 import redis
-from own_servers import Configured
+from own_servers import Configured, free_port
 
 from reem_async.server.process import find_program
-
-# Below the ports that the kernel gives to clients: while the server is down, one of them could be given its port.
-PORTS = range(20_000, 32_000)
 
 
 class PrivateServer:
@@ -30,7 +25,7 @@ class PrivateServer:
 
     def __init__(self, *lines: str, keep: bool = False) -> None:
         self.lines = [*lines, *(["appendfsync always"] if keep else [])]
-        self.port = _free_port()
+        self.port = free_port()
         self.directory = Path(tempfile.mkdtemp(prefix="reem-chaos-")) if keep else None
         self._process: Configured | None = None
         self._stopped = False
@@ -48,11 +43,9 @@ class PrivateServer:
         return redis.Redis(port=self.port, retry=None, socket_timeout=10, decode_responses=True, **options)
 
     def start(self) -> None:
-        """Start it; returns when it answers."""
         self._process = Configured(find_program(), self.lines, port=self.port, directory=self.directory)
 
     def kill(self) -> None:
-        """kill -9; returns when it is gone."""
         process = self._process
         assert process is not None
         os.kill(process.pid, signal.SIGKILL)
@@ -81,14 +74,3 @@ class PrivateServer:
             self._process.stop()
         if self.directory is not None:
             shutil.rmtree(self.directory, ignore_errors=True)
-
-
-def _free_port() -> int:
-    for port in random.sample(PORTS, 100):
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
-    raise OSError(f"no free port in {PORTS}")

@@ -13,7 +13,6 @@ from .hunter import Difference, Hunter
 
 
 def main() -> int:
-    """Hunt as the command line asks for; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.hunt", description="Random calls on REEM and on a dict.")
     parser.add_argument("--seed", type=int, default=None, help="what all chance comes from")
     parser.add_argument("--minutes", type=float, default=10.0)

@@ -31,7 +31,6 @@ NOTE = re.compile(rb"\{[^}]*\}:last")
 
 
 def same(read: Any, due: Any) -> bool:
-    """Return whether two values are the same, type by type and bit by bit."""
     if read is ABSENT or due is ABSENT:
         return read is due
     try:
@@ -42,20 +41,16 @@ def same(read: Any, due: Any) -> bool:
 
 
 def compare(read: Any, due: Any, what: str) -> None:
-    """Raise AssertionError if a value is not what it has to be."""
     if not same(read, due):
         raise AssertionError(f"{what}: {read!r:.2000}\nin place of {due!r:.2000}")
 
 
 class Server:
-    """What a bare client sees of a server."""
-
     def __init__(self, url: str, *, json: bool) -> None:
         self.url, self._get = url, "JSON.GET" if json else "GET"
         self.raw = redis.Redis.from_url(url)
 
     def check(self, documents: dict[str, Any]) -> None:
-        """Compare all that the server holds with the documents it has to hold."""
         due = set()
         for name, document in documents.items():
             due |= self._check_document(name, document)
@@ -148,7 +143,6 @@ class Follower:
             self.updates.append(update)
 
     def check(self, document: Any, *, exact: bool) -> None:
-        """Wait until all of them have what the model has; `exact` if no call was broken off."""
         due = found(document, self.path)
         bare = None if due is ABSENT else due
         what = f"{(self.name, *self.path)!r}"

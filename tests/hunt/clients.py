@@ -32,8 +32,6 @@ class Client:
 
 
 class Blocking(Client):
-    """The blocking front, on the thread that calls it."""
-
     def __init__(self, label: str, address: Address, namespace: str) -> None:
         super().__init__(label, address, namespace)
         self.open()

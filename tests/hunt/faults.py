@@ -64,7 +64,6 @@ def cut(rng: random.Random, proxy: Proxy, call: Callable[[], Any]) -> Any:
 
 
 def cancelled(rng: random.Random, client: Asyncio, op: Op, published: bool) -> bool:
-    """Make a call and cancel it at some instant; returns whether it was."""
     if rng.random() < 0.6:
         return client.cancelled(op, published, rng.randrange(12), 0)
     return client.cancelled(op, published, 0, 10 ** rng.uniform(-5, -2.5))

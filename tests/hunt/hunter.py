@@ -118,7 +118,6 @@ class Hunter:
             self._take(client, *self._choose(client))
 
     def _choose(self, client: Client, names: tuple[str, ...] = READS + CHANGES + ("write",) * 5) -> tuple[Op, str]:
-        """Return a call, and the whole name of its key."""
         if self.rng.random() < 0.01:
             return self.inputs.op(self.rng.choice(BAD_TOPS), ABSENT, names), ""
         top = self.rng.choice(TOPS[:4] if self.rng.random() < 0.3 else TOPS)
@@ -411,7 +410,6 @@ class Hunter:
         self.history.setdefault(full, collections.deque(maxlen=HISTORY)).append(f"{self.steps}: {text}")
 
     def _told(self, full: str) -> str:
-        """Return what was last done to a key, for a message."""
         return f"\nlast done to {full!r}:\n  " + "\n  ".join(self.history.get(full, ()))
 
 

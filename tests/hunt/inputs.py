@@ -46,7 +46,6 @@ class Inputs:
         self.rng = rng
 
     def key(self) -> Any:
-        """Return an element of a path, usually one that can be."""
         rng, kind = self.rng, self.rng.random()
         if kind < 0.5:
             return rng.choice(PLAIN)
@@ -65,7 +64,6 @@ class Inputs:
         return str(self.rng.choice(PLAIN if self.rng.random() < 0.6 else ODD + BRACES + UNADDRESSABLE))
 
     def array(self) -> Any:
-        """Return an array, some of them large."""
         rng = self.rng
         if rng.random() < 0.05:
             return np.full(LARGE, rng.randrange(256), np.uint8)
@@ -79,7 +77,6 @@ class Inputs:
         return (made if 0 in shape else made.reshape(shape)) if 0 not in shape else np.zeros(shape, dtype)
 
     def leaf(self) -> Any:
-        """Return a value that holds no others."""
         rng, kind = self.rng, self.rng.randrange(12)
         if kind < 3:
             return self.array()
@@ -100,7 +97,6 @@ class Inputs:
         return rng.choice([True, False, None, [], {}])
 
     def value(self, depth: int = 0) -> Any:
-        """Return a value that can be stored."""
         kind = self.rng.random()
         if depth > 2 or kind < 0.45:
             return self.leaf()
@@ -124,7 +120,6 @@ class Inputs:
         return tuple(path[:5])
 
     def op(self, top: Any, document: Any, names: tuple[str, ...] = READS + CHANGES + ("write",) * 5) -> Op:
-        """Return a call on a document."""
         rng, name = self.rng, self.rng.choice(names)
         path = self.path(document)
         if name in (*CALCULATIONS, "append", "extend", "edit") and rng.random() < 0.8:
@@ -177,7 +172,6 @@ def _places(tree: Any, depth: int) -> list[tuple[Any, ...]]:
 
 
 def dotted(path: tuple[Any, ...]) -> str | None:
-    """Return a full path as text, or None if there is no text for it."""
     top, *rest = path
     if not isinstance(top, str) or any(type(key) not in (str, int) or refused_in_path(key) for key in rest):
         return None

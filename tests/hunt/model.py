@@ -104,7 +104,6 @@ def as_read(value: Any) -> Any:
 
 
 def found(tree: Any, path: tuple[Any, ...]) -> Any:
-    """Return what is at a path of the model, or ABSENT."""
     for key in path:
         named = isinstance(tree, dict) and isinstance(key, str) and key in tree
         counted = isinstance(tree, list) and not isinstance(key, str) and -len(tree) <= key < len(tree)
@@ -258,7 +257,6 @@ class Place:
 
 
 def expected(document: Any, op: Op, namespace: str, *, write_only: bool) -> Expected:
-    """Return what has to come of a call on `document`, of a store or of a PublishSpace."""
     if refused_as_top(op.path[0], namespace):
         return Expected(document, error=BadKey)
     unreadable = write_only and op.name in READING

@@ -51,7 +51,6 @@ def imu(rng: random.Random) -> Iterator[list[Op]]:
 
 
 def camera(rng: random.Random) -> Iterator[list[Op]]:
-    """A frame, and what is made of it a moment later, inside of it."""
     number = 0
     while True:
         number += 1
