@@ -16,6 +16,7 @@ from reem_async._installation import CURE, original_reem
 from reem_async.concurrency.queues import Every, Last, Newest
 from reem_async.coordination.presence import NodeEvent, NodeInfo
 from reem_async.plan.placeholders import Unreadable
+from reem_async.plan.typed import Shape
 from reem_async.pubsub.events import Origin, Update
 
 from .accessor import Accessor, Publisher, Reader, Writer
@@ -62,7 +63,7 @@ __all__ = [
     "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter", "PartialWrite",
     "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
     "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady",
-    "ServerReadOnly", "ServiceError", "ServiceLost", "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
-    "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
+    "ServerReadOnly", "ServiceError", "ServiceLost", "Shape", "Silent", "SilentSubscriber", "SpecialDatatypeShip",
+    "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
     "WrongType", "timeout",
 ]  # fmt: skip

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import builtins
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, Self, overload
+from typing import Any, Self, TypeVar, overload
 
 from reem_async.coordination.parameters import prepared
 from reem_async.coordination.services import QUEUE
@@ -21,6 +22,9 @@ from .connection import RedisInterface
 from .coordination import Service, declared
 from .following import Watch
 from .mirror import Mirror
+from .view import View
+
+T = TypeVar("T")
 
 
 class OneKey:
@@ -147,6 +151,10 @@ class Accessor(Handle):
         core.Accessor.parameter, declared, lambda self: SimpleNamespace(parameter=partial(prepared, self.full_path))
     )
     _ipython_key_completions_ = known_keys
+
+    def of(self, kind: builtins.type[T]) -> View[T]:
+        """Return this place as objects of a class."""
+        return View(self, self._core.of(kind))
 
     # Not by way of the methods: an error that says it all shows one frame less.
 

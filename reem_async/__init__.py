@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .coordination.presence import NodeEvent, NodeInfo
     from .errors import *
     from .plan.placeholders import Unreadable
+    from .plan.typed import Shape
     from .pubsub.events import Origin, Update
     from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber
     from .ships import BlobShip, BytesShip, Jpeg, JpegShip, NumpyShip, Png, PngShip, SpecialDatatypeShip
@@ -34,8 +35,8 @@ __all__ = [
     "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter", "PartialWrite",
     "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
     "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady",
-    "ServerReadOnly", "ServiceError", "ServiceLost", "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
-    "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
+    "ServerReadOnly", "ServiceError", "ServiceLost", "Shape", "Silent", "SilentSubscriber", "SpecialDatatypeShip",
+    "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
     "WrongType", "timeout",
 ]  # fmt: skip
 
@@ -46,6 +47,7 @@ _HOMES = {
     ".coordination.parameters": ["Parameter"],
     ".coordination.presence": ["NodeEvent", "NodeInfo"],
     ".plan.placeholders": ["Unreadable"],
+    ".plan.typed": ["Shape"],
     ".pubsub.events": ["Origin", "Update"],
     ".pubsub.subscribers": ["CallbackSubscriber", "SilentSubscriber"],
     ".ships": ["BlobShip", "BytesShip", "Jpeg", "JpegShip", "NumpyShip", "Png", "PngShip", "SpecialDatatypeShip"],

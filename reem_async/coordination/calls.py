@@ -35,6 +35,7 @@ from ..plan.keys import Keys
 from ..plan.notices import assembled
 from ..plan.paths import Path, escaped, show
 from ..plan.reads import with_bytes
+from ..plan.typed import plain
 from ..pubsub.early import LoopMailbox
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import SubscriptionManager, manager_of
@@ -372,6 +373,7 @@ class Caller(Listener):
             directory = self._directories[path] = Directory(Names(self._keys, path))
         call = PendingCall(show((self._keys.name, *path)), directory, asyncio.get_running_loop().time() + limit)
         prefix = directory.names.values(messages.CALL, call.id)
+        arguments = {name: plain(each) for name, each in arguments.items()}
         value = await encoded(self._session, directory.names, prefix, arguments)
         self._pending[call.id] = call
         try:

@@ -40,6 +40,7 @@ from ..plan import Command, Reply
 from ..plan.arguments import whole
 from ..plan.keys import Keys
 from ..plan.paths import Path, shorten, show
+from ..plan.typed import Signature
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import manager_of
 from ..session import Session
@@ -139,6 +140,7 @@ class Served(Listener):
         self._session = session
         self._names = names
         self._function = function
+        self._signature = Signature(function)
         self._is_async = is_async(function)
         self._concurrency = concurrency
         self._bound = bound
@@ -297,7 +299,8 @@ class Served(Listener):
                 return
             if self._loop.time() < self._recorded_until:
                 request.record = {"arguments": given}
-            result = await self._called(request, given)
+            place = (self._names.keys.name, *self._names.path)
+            result = self._signature.result(await self._called(request, self._signature.arguments(given, place)), place)
             del given
             value = await encoded(self._session, self._names, prefix, result)
         except BaseException as error:

@@ -6,7 +6,7 @@ import builtins
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 
 import numpy as np
 
@@ -24,12 +24,14 @@ from ..pubsub.mirror import Mirror
 from ..pubsub.subscribers import Watch
 from .catalog import Outline, outline
 from .document import DocumentReader, DocumentWriter, opened, retried
+from .view import View
 
 if TYPE_CHECKING:
     from ..plan.reads import RawRead
     from ..session import Session
 
 _NOTHING: Any = object()
+T = TypeVar("T")
 
 
 class Accessor(Handle):
@@ -584,6 +586,15 @@ class Accessor(Handle):
         session = self._reader.session
         lease = Lease(session, self._reader.keys, ttl, name, take)
         return OwnedAccessor(self._reader, OwnedPublisher(lease, session), ())
+
+    def of(self, kind: builtins.type[T]) -> View[T]:
+        """Return this place as objects of a class: `arm = kvs["arm"].of(Arm)`, `await arm.read()`.
+
+        Args:
+            kind: A dataclass, `msgspec.Struct` or `pydantic.BaseModel`, or an annotation, such as `list[Arm]`. See
+                docs/howto/typed.md for the types that fields may have.
+        """
+        return View(self, kind)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, (type(self), self._writer.maker(), self._reader.session, self.full_path)

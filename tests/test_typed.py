@@ -1,0 +1,357 @@
+"""Typed views: dataclasses, structs and models in and out, in both fronts."""
+
+import dataclasses
+import datetime
+import decimal
+import enum
+import functools
+import json
+import pathlib
+import subprocess
+import sys
+import textwrap
+import typing
+import uuid
+
+import msgspec
+import numpy as np
+import pydantic
+import pytest
+from conftest import ROOT, sized
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import reem
+from reem_async.plan.typed import made, stored
+
+Joints = typing.Annotated[np.ndarray, reem.Shape(3), np.float64]
+
+
+class Mode(enum.Enum):
+    IDLE = "idle"
+    MOVING = "moving"
+
+
+class Level(enum.IntEnum):
+    LOW = 1
+    HIGH = 2
+
+
+@dataclasses.dataclass
+class Point:
+    x: float
+    y: float = 0.0
+
+
+class PointStruct(msgspec.Struct):
+    x: float
+    y: float = 0.0
+
+
+class PointModel(pydantic.BaseModel):
+    x: float
+    y: float = 0.0
+
+
+FIELDS = {
+    "flag": bool,
+    "count": int,
+    "ratio": float,
+    "name": str,
+    "raw": bytes,
+    "maybe": int | None,
+    "either": typing.Union[Point, str, None],  # noqa: UP007 - both notations
+    "mode": Mode,
+    "level": Level,
+    "word": typing.Literal["a", 1],
+    "when": datetime.datetime,
+    "day": datetime.date,
+    "clock": datetime.time,
+    "span": datetime.timedelta,
+    "path": pathlib.Path,
+    "id": uuid.UUID,
+    "price": decimal.Decimal,
+    "numbers": list[float],
+    "words": set[str],
+    "fixed": frozenset[int],
+    "pair": tuple[int, str],
+    "row": tuple[int, ...],
+    "points": dict[str, Point],
+    "tree": list[dict[str, Point | None]],
+    "anything": typing.Any,
+}
+RAW = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=5,
+)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def values_of(annotation):
+    """What hypothesis makes for an annotation, as far as a document can hold it."""
+    special = {
+        float: FINITE,
+        int: st.integers(-(2**63), 2**64 - 1),
+        typing.Any: RAW,
+        decimal.Decimal: st.decimals(allow_nan=False, allow_infinity=False),
+        pathlib.Path: st.text("abc/.", min_size=1).map(pathlib.Path),
+        str: st.text(),
+        datetime.timedelta: st.timedeltas(datetime.timedelta(-9999), datetime.timedelta(9999)),
+        datetime.datetime: st.datetimes(timezones=st.none() | st.just(datetime.UTC)),
+        Point: st.builds(Point, FINITE, FINITE),
+    }
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if annotation in special:
+        return special[annotation]
+    if origin in (list, set, frozenset):
+        inner = values_of(arguments[0])
+        return {list: st.lists, set: st.sets, frozenset: st.frozensets}[origin](inner, max_size=4)
+    if origin is dict:
+        return st.dictionaries(st.text(max_size=4), values_of(arguments[1]), max_size=4)
+    if origin is tuple and arguments[-1] is not ...:
+        return st.tuples(*map(values_of, arguments))
+    if origin is tuple:
+        return st.lists(values_of(arguments[0]), max_size=4).map(tuple)
+    if origin is typing.Literal:
+        return st.sampled_from(arguments)
+    if origin is not None:
+        return st.one_of(*map(values_of, arguments))
+    return st.from_type(annotation)
+
+
+def slotted(fields):
+    return dataclasses.make_dataclass("Frozen", [*fields.items()], frozen=True, slots=True)
+
+
+KINDS = {
+    "dataclass": lambda fields: dataclasses.make_dataclass("All", [*fields.items()]),
+    "frozen dataclass with slots": slotted,
+    "msgspec.Struct": lambda fields: msgspec.defstruct("All", [*fields.items()]),
+    "pydantic.BaseModel": lambda fields: pydantic.create_model("All", **{n: (each, ...) for n, each in fields.items()}),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=sized(20, 100), deadline=None)
+@given(st.fixed_dictionaries({name: values_of(each) for name, each in FIELDS.items()}))
+def test_objects_are_the_same_after_the_way_through_a_document(kind, values):
+    fields = {n: each for n, each in FIELDS.items() if kind != "pydantic.BaseModel" or n not in ("either", "tree")}
+    cls = made_class(kind, tuple(fields))
+    value = cls(**{name: values[name] for name in fields})
+    document = stored(cls, value, ("k",))
+    assert_plain(document)
+    found = made(cls, document, ("k",))
+    assert type(found) is cls
+    for name in fields:
+        assert getattr(found, name) == getattr(value, name), name
+        assert type(getattr(found, name)) is type(getattr(value, name))
+
+
+@functools.cache
+def made_class(kind, names):
+    return KINDS[kind]({name: FIELDS[name] for name in names})
+
+
+def assert_plain(value):
+    """Only what documents hold."""
+    assert type(value) in (dict, list, str, int, float, bool, bytes, type(None))
+    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        assert_plain(each)
+
+
+@dataclasses.dataclass
+class Arm:
+    joints: Joints
+    mode: Mode = Mode.IDLE
+    points: list[Point] = dataclasses.field(default_factory=list)
+    seen: datetime.datetime | None = None
+
+
+GOOD = {"joints": np.arange(3.0), "mode": "moving", "points": [{"x": 1.5}], "newer": {"field": 1}}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joints": np.zeros(4)}, "arm.joints: expected an array of shape (3,), found float64[4] (ndarray)"),
+        ({"joints": np.zeros(3, int)}, "arm.joints: expected an array of float64, found int64[3] (ndarray)"),
+        ({"joints": [1.0, 2.0, 3.0]}, "arm.joints: expected ndarray, found [1.0, 2.0, 3.0] (list)"),
+        ({"mode": "gone"}, "arm.mode: expected a value of Mode: 'idle', 'moving', found 'gone' (str)"),
+        ({"points": [{"x": "1"}]}, "arm.points[0].x: expected int or float, found '1' (str)"),
+        ({"points": [{"y": 1}]}, "arm.points[0].x: float is missing"),
+        ({"seen": "yesterday"}, "arm.seen: expected datetime.datetime | None, found 'yesterday' (str)"),
+        ({"points": True}, "arm.points: expected list or tuple, found True (bool)"),
+    ],
+)
+def test_what_is_stored_and_is_not_what_the_class_says_is_named(kvs, key, change, message):
+    name = key("arm")
+    kvs[name] = {**GOOD, **change}
+    view = kvs[name].of(Arm)
+    for refused in (view.read, view.watch().next, lambda: view.edit().__enter__()):
+        with pytest.raises(reem.BadData) as caught:
+            refused()
+        assert str(caught.value) == message.replace("arm", name, 1)
+    with view.mirror() as mirror, pytest.raises(reem.BadData):
+        mirror.value()
+
+
+@pytest.mark.parametrize("kind", [Point, PointStruct, PointModel])
+def test_an_object_that_is_not_what_its_class_says_is_refused_before_it_is_sent(kvs, key, kind):
+    name = key("point")
+    view = kvs[name].of(kind)
+    wrong = kind(x=1.0)
+    if kind is PointModel:
+        object.__setattr__(wrong, "x", "far")
+    else:
+        wrong.x = "far"
+    with pytest.raises(reem.BadValue, match=rf"{name}.x: expected int or float, found 'far' \(str\)"):
+        view.write(wrong)
+    with pytest.raises(reem.BadValue, match=f"{name}: expected {kind.__name__}, found"):
+        view.write({"x": 1.0})
+    with pytest.raises(reem.BadValue, match="exactly"):
+        kvs[name].of(datetime.timedelta).write(datetime.timedelta(99421, microseconds=1))
+    assert name not in kvs
+    with pytest.raises(reem.MissingKey, match=f"{name}: nothing is stored here"):
+        view.read()
+
+
+def test_what_a_class_itself_checks_is_checked_when_it_is_read(kvs, key):
+    class Strict(msgspec.Struct):
+        speed: typing.Annotated[float, msgspec.Meta(le=1.0)]
+
+    class Model(pydantic.BaseModel):
+        speed: float = pydantic.Field(le=1.0)
+
+    name = key("drive")
+    kvs[name] = {"speed": 2.0}
+    for kind in (Strict, Model):
+        with pytest.raises(reem.BadData, match=name):
+            kvs[name].of(kind).read()
+
+
+def test_a_view_reads_writes_edits_and_follows(kvs, pspace, key):
+    name = key("arm")
+    arm = kvs[name].of(Arm)
+    kvs[name] = GOOD
+    found = arm.read()
+    assert (found.mode, found.points, found.seen) == (Mode.MOVING, [Point(1.5)], None)
+    found.points.append(Point(2, 3))
+    arm.write(found)
+    assert kvs[name]["newer"].read() == {"field": 1}  # what the class does not know stays
+    with arm.edit() as value:
+        value.mode, value.points = Mode.IDLE, [Point(9)]
+    edited = kvs[name].read()
+    assert edited.pop("joints").tolist() == [0.0, 1.0, 2.0]
+    assert edited == {"newer": {"field": 1}, "mode": "idle", "points": [{"x": 9.0, "y": 0.0}], "seen": None}
+    arm.at(lambda it: it.points[0]).write(Point(4, 5))
+    assert arm.points[0].x.read() == 4.0
+    with arm.mirror() as mirror, arm.watch() as watch:
+        assert watch.next(5).data.mode is Mode.IDLE
+        pspace[name].of(Arm).write(Arm(np.ones(3), Mode.MOVING))
+        update = watch.next(5)
+        assert update.data.mode is Mode.MOVING
+        assert update.origin == "published"
+        mirror._mirror.wait_until(lambda data: data["mode"] == "moving", 5)
+        assert mirror.value().points == []
+        kvs[name].delete()
+        assert watch.next(5).data is None
+        mirror._mirror.wait_until(lambda data: data is None, 5)
+        assert mirror.value(found) is found
+        with pytest.raises(reem.MissingKey):
+            mirror.value()
+    for wrong in ("speed", 0):
+        with pytest.raises(reem.BadType, match=f"{name}: Arm has no {wrong!r}; it has joints, mode, points, seen"):
+            arm[wrong]
+    with pytest.raises(reem.BadType, match="lambda"):
+        arm.at(lambda it: 3)
+
+
+async def test_a_view_in_asyncio(akvs, apspace, key):
+    name = key("arm")
+    arm = akvs[name].of(Arm)
+    await arm.write(Arm(np.zeros(3), seen=datetime.datetime(2026, 11, 26, tzinfo=datetime.UTC)))
+    assert (await arm.read()).seen.year == 2026
+    async with arm.edit() as value:
+        value.points = [Point(1)]
+    async with arm.mirror() as mirror, arm.watch() as watch:
+        assert (await anext(watch)).data.points == mirror.value().points == [Point(1)]
+        await apspace[name].of(Arm).mode.write(Mode.MOVING)
+        assert (await watch.next(5)).data.mode is Mode.MOVING
+    assert await arm.at(lambda it: it.points[0].x).read() == 1.0
+
+
+def test_a_service_gets_and_gives_objects(kvs, key):
+    def farthest(points: list[Point], limit: float, mode: Mode = Mode.IDLE) -> Point:
+        assert all(type(each) is Point for each in points)
+        return max(points, key=lambda each: each.x) if mode is Mode.IDLE else Point("x")
+
+    service = kvs[key("service")]
+    with service.serve(farthest):
+        assert service.call(points=[{"x": 1}, {"x": 2}], limit=1) == {"x": 2.0, "y": 0.0}
+        with pytest.raises(reem.RemoteError, match=r"points\[0\].x: expected int or float, found 'a'"):
+            service.call(points=[{"x": "a"}], limit=1)
+        with pytest.raises(reem.RemoteError, match="expected int or float, found 'x'"):
+            service.call(points=[], limit=1, mode="moving")
+
+    def norm(point: Point) -> float:
+        return point.x + point.y
+
+    with service.serve(norm):
+        assert service.call(point=Point(1, 2)) == service.call(point=PointStruct(1, 2)) == 3.0
+
+
+@pytest.mark.parametrize(
+    ("annotation", "message"),
+    [
+        (dict[int, str], "the keys of a dict are str, not int"),
+        (complex, "complex cannot be the type of what is stored"),
+    ],
+)
+def test_types_that_no_document_has_are_refused(kvs, key, annotation, message):
+    with pytest.raises(reem.BadType, match=message):
+        kvs[key()].of(annotation).write({})
+
+
+PROGRAM = """
+    import dataclasses
+    from typing import assert_type
+    import reem, reem_async
+
+    @dataclasses.dataclass
+    class Arm:
+        speed: float
+        names: list[str]
+
+    def plain(kvs: reem.KeyValueStore) -> None:
+        arm = kvs["arm"].of(Arm)
+        assert_type(arm.read(), Arm)
+        assert_type(arm.at(lambda it: it.names[0]).read(), str)
+        assert_type(next(arm.watch()).data, Arm)
+        assert_type(arm.mirror().value(), Arm)
+        with arm.edit() as value:
+            assert_type(value, Arm)
+        arm.write(3)  # wrong
+
+    async def asynchronous(kvs: reem_async.KeyValueStore) -> None:
+        arm = kvs["arm"].of(Arm)
+        assert_type(await arm.read(), Arm)
+        await arm.at(lambda it: it.speed).write("fast")  # wrong
+        async for update in arm.watch():
+            assert_type(update.data, Arm)
+"""
+
+
+@pytest.mark.parametrize("checker", ["mypy", "basedpyright"])
+@pytest.mark.long
+def test_type_checkers_know_the_class_of_a_view(checker, tmp_path):
+    (tmp_path / "program.py").write_text(textwrap.dedent(PROGRAM))
+    (tmp_path / "pyrightconfig.json").write_text(
+        json.dumps({"extraPaths": [str(ROOT)], "typeCheckingMode": "standard"})
+    )
+    pytest.importorskip(checker)
+    command = [sys.executable, "-m", checker, *(["--strict"] if checker == "mypy" else []), "program.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    wrong = [line for line in done.stdout.splitlines() if "error:" in line]
+    assert len(wrong) == 2, done.stdout
+    assert all("Arm" in line or "float" in line for line in wrong)
