@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 
 from reem_async.concurrency.queues import Policy
 from reem_async.store import view as core
@@ -13,9 +13,6 @@ from ._twin import documented_by
 from .following import Following, Watch
 from .mirror import Mirror
 
-if TYPE_CHECKING:
-    from .accessor import Accessor, Edit
-
 T = TypeVar("T")
 F = TypeVar("F")
 
@@ -24,7 +21,8 @@ F = TypeVar("F")
 class View(Generic[T]):
     """One place in the dictionary, read and written as objects of a class: `arm = kvs["arm"].of(Arm)`."""
 
-    def __init__(self, accessor: Accessor, inner: core.View[T]) -> None:
+    # The accessor is of `accessor.py`, which imports this module.
+    def __init__(self, accessor: Any, inner: core.View[T]) -> None:
         self._accessor = accessor
         self._interface = accessor._interface
         self._core = inner
@@ -44,7 +42,8 @@ class View(Generic[T]):
 
     def read(self) -> T:
         """Return the object here."""
-        return self._interface._run(self._core.read())
+        value: T = self._interface._run(self._core.read())
+        return value
 
     def write(self, value: T) -> None:
         """Store an object here."""
@@ -115,7 +114,7 @@ class ViewMirror(Following, Generic[T]):
 class ViewEdit(Generic[T]):
     """What `View.edit` returns."""
 
-    def __init__(self, edit: Edit, view: core.View[T]) -> None:
+    def __init__(self, edit: Any, view: core.View[T]) -> None:
         self._edit = edit
         self._changes = core.Changes(view)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 
 from ..concurrency.queues import Policy
 from ..concurrency.streams import Following
@@ -15,9 +15,6 @@ from ..plan.trees import MISSING
 from ..pubsub.events import Update
 from ..pubsub.mirror import Mirror
 from ..pubsub.subscribers import Watch
-
-if TYPE_CHECKING:
-    from .accessor import Accessor, Edit
 
 T = TypeVar("T")
 F = TypeVar("F")
@@ -59,7 +56,8 @@ class View(Generic[T]):
     a method. Costs, atomicity and errors are those of the accessor.
     """
 
-    def __init__(self, accessor: Accessor, annotation: Any) -> None:
+    # The accessor is of `accessor.py`, which imports this module.
+    def __init__(self, accessor: Any, annotation: Any) -> None:
         self._accessor = accessor
         self._annotation = annotation
 
@@ -215,7 +213,7 @@ def mirrored(mirror: Any, view: View[T], default: tuple[T, ...]) -> T:
 class ViewEdit(Generic[T]):
     """What `View.edit` returns."""
 
-    def __init__(self, edit: Edit, view: View[T]) -> None:
+    def __init__(self, edit: Any, view: View[T]) -> None:
         self._edit = edit
         self._changes = Changes(view)
 
