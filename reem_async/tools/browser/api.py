@@ -16,24 +16,10 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
+from ... import errors
 from ...coordination.parameters import StoredParameter
 from ...coordination.specification import as_json
-from ...errors import (
-    BadData,
-    BadInput,
-    BadKey,
-    BadType,
-    BadValue,
-    MissingKey,
-    NotAllowed,
-    PartialWrite,
-    PathRefused,
-    RedisError,
-    ReemError,
-    ServerFull,
-    ServerReadOnly,
-    WrongKind,
-)
+from ...errors import BadData, BadKey, BadType, BadValue, MissingKey, RedisError, ReemError
 from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import walk
@@ -50,11 +36,12 @@ LARGEST_BODY = 1 << 16  # bytes: what a person edits on a page
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (NotKept, 409),
     (MissingKey, 404),
-    (BadInput, 400),
-    (PathRefused, 409),
+    (errors.BadInput, 400),
+    (errors.PathRefused, 409),
     (BadData, 422),
     # The server answers, and refuses this: a page must not take it for lost.
-    *((refusal, 409) for refusal in (WrongKind, PartialWrite, NotAllowed, ServerFull, ServerReadOnly)),
+    *((kind, 409) for kind in (errors.WrongKind, errors.PartialWrite, errors.NotAllowed)),
+    *((kind, 409) for kind in (errors.ServerFull, errors.ServerReadOnly)),
     (RedisError, 503),
     (OSError, 503),
     (ReemError, 500),

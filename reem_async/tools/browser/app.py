@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import html
 import ipaddress
+import mimetypes
 import secrets
 import socket
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from http.cookies import CookieError, SimpleCookie
-from importlib import resources
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
@@ -19,8 +20,9 @@ from starlette.applications import Starlette
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ...errors import BadKey, ServerFailed
@@ -216,7 +218,8 @@ def listen(host: str, port: int) -> socket.socket:
 
 # The application.
 
-_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
+_FOLDER = Path(__file__).parent
+mimetypes.add_type("text/javascript", ".js")  # Python 3.11 has another type, and some systems have none
 
 
 def create_app(
@@ -238,10 +241,8 @@ def create_app(
         hosts: The names that a request's Host header may have; anything else is refused.
         any_address: An IP address may be in the Host header as well.
     """
-    # Read once, at the start: nothing that a request says becomes the name of a file.
-    files = _files()
     api = Api(source, allow_write)
-    pages = _Pages(source, api, files)
+    view = _view(source, api)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -257,9 +258,9 @@ def create_app(
     routes = [*api.routes(), *Arrays(source).routes(), *Events(source, lambda: app.state.ending).routes()]
     app.router.routes.extend(
         [
-            Route("/", pages.view, methods=["GET"]),
-            Route("/view/{where:path}", pages.view, methods=["GET"]),
-            Route("/static/{name}", pages.static, methods=["GET"]),
+            Route("/", view, methods=["GET"]),
+            Route("/view/{where:path}", view, methods=["GET"]),
+            Mount("/static", StaticFiles(directory=_FOLDER / "static")),
             Mount("/api", routes=routes),
         ]
     )
@@ -267,40 +268,23 @@ def create_app(
     return app
 
 
-def _files() -> dict[str, bytes]:
-    """Return the files of the page, by name: nothing else is ever served."""
-    folder = resources.files(__package__) / "static"
-    return {file.name: file.read_bytes() for file in folder.iterdir() if file.name.endswith(tuple(_TYPES))}
+def _view(source: Source, api: Api) -> Callable[[Request], Awaitable[Response]]:
+    """Return what answers with the one page, in which the scripts show what its address says."""
+    template = (_FOLDER / "page.html").read_text(encoding="utf-8")
+    template = template.replace("{title}", html.escape(visible(source.title)))
 
-
-class _Pages:
-    """The one page, in which the scripts show what its address says, and its files."""
-
-    def __init__(self, source: Source, api: Api, files: dict[str, bytes]) -> None:
-        self._source = source
-        self._api = api
-        self._files = files
-
-    async def view(self, request: Request) -> Response:
+    async def view(request: Request) -> Response:
         try:
             path_of(request.path_params.get("where", ""))
         except BadKey as error:
             return PlainTextResponse(f"{visible(str(error))}\n", 404)
         config: dict[str, Any] = {
-            "title": self._source.title,
-            "live": self._source.live,
-            "write": self._api.allow_write,
-            "key": self._api.key if self._api.allow_write else "",
-            **self._source.status()._asdict(),
+            "title": source.title,
+            "live": source.live,
+            "write": api.allow_write,
+            "key": api.key if api.allow_write else "",
+            **source.status()._asdict(),
         }
-        page = self._files["page.html"].decode()
-        page = page.replace("{title}", html.escape(visible(self._source.title)))
-        return Response(page.replace("{config}", html.escape(orjson.dumps(config).decode())), media_type="text/html")
+        return HTMLResponse(template.replace("{config}", html.escape(orjson.dumps(config).decode())))
 
-    async def static(self, request: Request) -> Response:
-        name = request.path_params["name"]
-        content = self._files.get(name)
-        if content is None or name == "page.html":
-            return PlainTextResponse("There is no such file.\n", 404)
-        kind = next(kind for suffix, kind in _TYPES.items() if name.endswith(suffix))
-        return Response(content, media_type=kind, headers={"cache-control": "no-cache"})
+    return view

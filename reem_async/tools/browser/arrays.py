@@ -147,16 +147,8 @@ class Arrays:
         self._turns = anyio.CapacityLimiter(1)  # one at a time: numpy would take all processors
 
     def routes(self) -> list[Route]:
-        asked = {
-            "image": self.image,
-            "table": self.table,
-            "line": self.line,
-            "histogram": self.histogram,
-            "bytes": self.dump,
-            "picture": self.picture,
-            "colours": self.colours,
-        }
-        routes = [Route(f"/{name}", answered(handler), methods=["GET"]) for name, handler in asked.items()]
+        asked = self.image, self.table, self.line, self.histogram, self.bytes, self.picture, self.colours
+        routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         return [*routes, Route("/array", told(self.array), methods=["GET"])]
 
     async def _do(self, size: int, work: Callable[[], Result]) -> Result:
@@ -245,7 +237,7 @@ class Arrays:
         some = part(array, _slice(request, array, array.ndim))
         return reply({**await self._do(some.nbytes, lambda: histogram(some)), **said})
 
-    async def dump(self, request: Request) -> Response:
+    async def bytes(self, request: Request) -> Response:
         """Return the beginning of bytes in hexadecimal, and whether they are a picture."""
         value = await self._bytes(request)
         lines = [value[start : start + 16] for start in range(0, min(len(value), _HEX_BYTES), 16)]

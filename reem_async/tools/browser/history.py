@@ -325,12 +325,12 @@ class History:
             found |= self._lines[name].last(group, at)
         return found
 
-    def rate(self, name: str, at: float, over: float = 5.0) -> float | None:
+    def rate(self, name: str, at: float) -> float | None:
         """Return updates per second of a key about `at`; None if there was none, or it is not known yet."""
         line = self._lines.get(name)
         if line is None:
             return None
-        span = rate_span(at, self.start, max(self.clock.now(), at), over)
+        span = rate_span(at, self.start, max(self.clock.now(), at))
         if span is None:
             return None
         some = line.changes[line.upto(span[0]) : line.upto(span[1])]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from ...connection import RedisInterface
@@ -11,30 +13,16 @@ from ...coordination.calls import statistics
 from ...coordination.parameters import SPECIFICATIONS, StoredParameter, publish, stored_parameters
 from ...errors import BadType, ConnectionLost, MissingKey, NotAllowed, NotConnected, ServerNotReady
 from ...plan.paths import Path, show
-from ...plan.placeholders import Unfetched
-from ...plan.trees import MISSING, walk
-from ...store.catalog import outline
+from ...plan.trees import MISSING
+from ...store.catalog import Outline, outline
 from ...store.document import DocumentReader
 from ...store.store import PublishSpace
 from .follower import Follower
 from .history import History
 from .partial_reads import keys_at, peek
-from .source import (
-    Node,
-    NotKept,
-    Page,
-    Sample,
-    Series,
-    Status,
-    address,
-    counted,
-    matching,
-    node_of,
-    numbers_in,
-    snippets,
-)
+from .source import Node, NotKept, Page, Sample, Series, Status, counted, matching, node_of, numbers_in, snippets
 from .timeline import UNKNOWN
-from .trees import Frame, differing, thawed, tree_of_outline
+from .trees import Frame, differing, thawed
 
 _LARGEST = 1 << 28  # bytes of arrays up to which a value is read for a page
 _SHARED_SECONDS = 0.2  # how long one reading of a large value serves all requests
@@ -67,8 +55,8 @@ class LiveSource:
         self.title = interface.hostname + (f" · {interface.namespace}" if interface.namespace else "")
         self.history = History(seconds, budget)
         self._follower = Follower(interface, self.history)
-        self._shared: dict[str, asyncio.Task[Any]] = {}
-        self._space = PublishSpace(interface)
+        self._shared: dict[Path, asyncio.Task[Any]] = {}
+        self._space: Any = PublishSpace(interface)
 
     async def start(self) -> None:
         """Connect and begin to follow. Idempotent; raises NotConnected and the like."""
@@ -189,19 +177,18 @@ class LiveSource:
         return None if at is None or since is None else max(at - since, 0.0)
 
     async def _read(self, path: Path) -> Any:
-        key = address(path)
-        if key not in self._shared:
+        if path not in self._shared:
             # One reading of a camera serves all panes and pages that ask at the same time.
-            self._shared[key] = asyncio.create_task(self._read_new(path))
-            self._shared[key].add_done_callback(lambda done: self._let_go(key, done))
+            self._shared[path] = asyncio.create_task(self._read_new(path))
+            self._shared[path].add_done_callback(lambda done: self._let_go(path, done))
         # A cancelled request must not end the reading for the others.
-        return await asyncio.shield(self._shared[key])
+        return await asyncio.shield(self._shared[path])
 
-    def _let_go(self, key: str, done: asyncio.Task[Any]) -> None:
+    def _let_go(self, path: Path, done: asyncio.Task[Any]) -> None:
         if not done.cancelled():
             # Retrieved, so that asyncio does not complain if no request waits for it any more.
             done.exception()
-        asyncio.get_running_loop().call_later(_SHARED_SECONDS, self._shared.pop, key, None)
+        asyncio.get_running_loop().call_later(_SHARED_SECONDS, self._shared.pop, path, None)
 
     async def _read_new(self, path: Path) -> Any:
         (node,) = await peek(self.interface.session, [path])
@@ -244,16 +231,10 @@ class LiveSource:
         if node.count is None and node.kind not in ("str", "int", "float", "bool", "NoneType"):
             raise BadType(f"{show(path)} is of type {node.kind}, which a page cannot write; use Python")
         # A dict that holds arrays would lose them: what the page sends is JSON.
-        if node.count is not None and await self._has_leaves(path):
+        if node.count is not None and _has_leaves(await outline(self.interface, path)):
             raise BadType(f"{show(path)} holds arrays or bytes, which a page cannot write; edit what is below it")
-        accessor: Any = self._space
-        for key in path:
-            accessor = accessor[key]
+        accessor: Any = reduce(getitem, path, self._space)
         await accessor.write(value)
-
-    async def _has_leaves(self, path: Path) -> bool:
-        tree = tree_of_outline(await outline(self.interface, path))
-        return any(isinstance(it, Unfetched) for _, it in walk(tree, path))
 
     # --- time
 
@@ -294,3 +275,7 @@ class LiveSource:
         """Return paths with `text` in them: keys first, then what is below those that the buffer knows."""
         needle, when = text.lower(), self.history.clock.now() if at is None else at
         return matching(needle, self._names(at), self.history.trees(when), most)
+
+
+def _has_leaves(node: Outline) -> bool:
+    return any(map(_has_leaves, node.children)) if node.kind in ("dict", "list") else not node.plain

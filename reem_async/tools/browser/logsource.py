@@ -11,7 +11,6 @@ import anyio
 import anyio.to_thread
 import numpy as np
 
-from ...coordination.parameters import StoredParameter
 from ...errors import MissingKey, ReadOnly
 from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched
@@ -22,6 +21,7 @@ from .source import (
     Page,
     Sample,
     Series,
+    Source,
     Status,
     counted,
     is_small_vector,
@@ -41,7 +41,7 @@ _ROUNDING = 1e-6
 """Seconds: instants here are floats, those in the file nanoseconds; what happens at an instant belongs to it."""
 
 
-class LogSource:
+class LogSource(Source):
     """What a recording says that a server held.
 
     Reading takes place in a thread, one at a time.
@@ -143,10 +143,6 @@ class LogSource:
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
         return await self._do(lambda: counted(self._times(path), start, end, bins))
 
-    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
-        """Return nothing: a recording has all its arrays."""
-        return []
-
     async def series(self, path: Path, start: float, end: float) -> Series:
         return await self._do(lambda: numbers_in(self._samples(path, start, end)))
 
@@ -162,12 +158,6 @@ class LogSource:
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
         state = await self._do(lambda: self._state(self._when(at)))
         return await self._do(lambda: matching(text.lower(), sorted(state), state.items(), most))
-
-    async def parameters(self, path: Path) -> list[StoredParameter]:
-        return []  # they cannot be set; `_parameters` is shown as any key
-
-    async def services(self) -> list[dict[str, Any]]:
-        return []  # none of them runs any more
 
     async def write(self, path: Path, value: Any) -> None:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")

@@ -218,10 +218,12 @@ class Source(Protocol):
     async def write(self, path: Path, value: Any) -> None: ...
 
     # What programs have declared at and below a path.
-    async def parameters(self, path: Path) -> list[StoredParameter]: ...
+    async def parameters(self, path: Path) -> list[StoredParameter]:
+        return []
 
     # What the servers of services say now, see `statistics` in coordination/calls.py.
-    async def services(self) -> list[dict[str, Any]]: ...
+    async def services(self) -> list[dict[str, Any]]:
+        return []
 
     # Which paths were published or seen to change; which have another value at one instant than at another.
     async def changes(self, since: float, until: float, most: int) -> list[Path]: ...
@@ -230,7 +232,9 @@ class Source(Protocol):
     # How many changes fall into each of `bins` equal parts of a span, and how the arrays of that part are kept: 2
     # whole, 1 as previews, 0 not. Empty if all are kept, or there are none.
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]: ...
-    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]: ...
+    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
+        return []
+
     async def series(self, path: Path, start: float, end: float) -> Series: ...
 
 
@@ -240,13 +244,13 @@ _SHORTEST_RATE = 1.0
 """Seconds: at the beginning of what is known, where there is no such span before an instant, it is the one after."""
 
 
-def rate_span(at: float, start: float, end: float, over: float = _RATE_SECONDS) -> tuple[float, float] | None:
+def rate_span(at: float, start: float, end: float) -> tuple[float, float] | None:
     """Return the span in which updates are counted for the rate at an instant; None if too little is known.
 
-    The past is known from `start` to `end`. The span is `over` seconds long where it can be.
+    The past is known from `start` to `end`.
     """
-    since = max(at - over, start)
-    until = max(at, since + min(over, _SHORTEST_RATE))
+    since = max(at - _RATE_SECONDS, start)
+    until = max(at, since + _SHORTEST_RATE)
     return None if until > end else (since, until)
 
 

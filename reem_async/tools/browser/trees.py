@@ -16,7 +16,6 @@ from ...plan.placeholders import Unfetched, Unreadable, find, marked
 from ...plan.trees import MISSING, get, mapped, walk
 from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip
-from ...store.catalog import Outline
 from .pictures import preview_of
 
 _NUMPY = NumpyShip()
@@ -89,16 +88,6 @@ def tree_of(text: bytes, name: str) -> Any:
         it = slot.placeholder
         slot.container[slot.key] = Unfetched(it.label, it.size, it.summary)
     return holder[0]
-
-
-def tree_of_outline(it: Outline) -> Any:
-    if it.kind == "dict":
-        return {str(child.path[-1]): tree_of_outline(child) for child in it.children}
-    if it.kind == "list":
-        return [tree_of_outline(child) for child in it.children]
-    if it.kind in ("str", "int", "float", "bool", "NoneType"):
-        return it.value
-    return Unfetched(it.kind, it.size, it.summary)
 
 
 def same(one: Any, other: Any) -> bool:
