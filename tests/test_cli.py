@@ -37,7 +37,7 @@ def kvs(cli):
 
 
 SNAPSHOT = [["snapshot", command] for command in ("save", "list", "restore")]
-PARAM = [["param", command] for command in ("list", "get", "set", "save", "load", "forget")]
+PARAM = [["param", command] for command in ("list", "get", "set", "save", "load")]
 
 # --- the whole -------------------------------------------------
 

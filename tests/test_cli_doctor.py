@@ -41,7 +41,6 @@ def test_a_server_as_it_should_be(own):
     assert admin.info("server")["redis_version"] in run.stdout or "valkey" in report["server"]["message"]
     assert report["json"]["message"].startswith("none: documents are kept as text" if PLAIN else "RedisJSON 2.")
     assert re.search(r"median \S+ ms, p99 \S+ ms, of \d+$", report["latency"]["message"])
-    assert "33.6 MB" in report["subscribers"]["message"]
     assert {"server", "libraries"} <= set(report)
     assert admin.dbsize() == 0
 
@@ -89,10 +88,9 @@ def test_a_user_who_may_do_little(own):
     run = cli("doctor", "--json")
     assert run.returncode == 0, run.stdout + run.stderr
     report = findings(run)
-    for name in ("latency", "clock", "memory", "eviction", "subscribers", "persistence"):
+    for name in ("latency", "clock", "memory", "eviction", "persistence"):
         assert report[name]["status"] == UNKNOWN, name
     assert report["memory"]["remedy"] == "ask as an administrator, or allow +info"
-    assert report["subscribers"]["remedy"] == "ask as an administrator, or allow +config|get"
     assert "with password, without TLS" in report["access"]["message"]
     assert "hidden" not in run.stdout + run.stderr
     said = cli.error(1, "ls")
@@ -120,7 +118,7 @@ def test_every_node_of_a_cluster_is_examined_and_named():
         bad.stop()
         without = cli("doctor", "--json")
     assert run.returncode == 0, run.stdout + run.stderr
-    for check in ("server", "json", "access", "latency", "clock", "memory", "subscribers"):
+    for check in ("server", "json", "access", "latency", "clock", "memory"):
         assert {node for node, _ in nodes_with(run, check)} == set(ports), check
     found = nodes_with(run, "eviction")
     assert dict(found) == {port: WARN if port == ports[1] else OK for port in ports}
@@ -135,7 +133,6 @@ def test_every_node_of_a_cluster_is_examined_and_named():
 
 
 SAVED = {"rdb_last_bgsave_status": "ok", "aof_enabled": "0"}
-BUFFERS = "client-output-buffer-limit"
 
 
 @pytest.mark.parametrize(
@@ -153,17 +150,6 @@ BUFFERS = "client-output-buffer-limit"
         (checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "0"}, None, OK),
         (checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "9"}, None, WARN),
         (checks.eviction, {"evicted_keys": "3"}, None, FAIL),
-        (checks.subscribers, {}, {BUFFERS: "normal 0 0 0 slave 1 1 1 pubsub 33554432 8388608 60"}, OK),
-        (checks.subscribers, {}, {BUFFERS: "pubsub 0 0 0"}, OK),
-        (checks.subscribers, {}, {BUFFERS: "pubsub 1000 0 0"}, WARN),
-        (
-            checks.subscribers,
-            {"client_output_buffer_limit_disconnections": "2"},
-            {BUFFERS: "pubsub 33554432 8388608 60"},
-            WARN,
-        ),
-        (checks.subscribers, {}, {BUFFERS: "normal 0 0 0"}, UNKNOWN),
-        (checks.subscribers, {}, None, UNKNOWN),
     ],
 )
 def test_what_the_facts_mean(check, info, config, status):

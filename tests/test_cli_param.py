@@ -72,7 +72,7 @@ def test_what_is_not_allowed_is_refused_and_stays_unsent(cli, store):
         before = store.get(path)
         assert message in cli.error(2, "set", path, typed)
         assert store.get(path) == before
-    for command in (["get", "arm.no"], ["set", "arm.no", "1"], ["forget", "arm.no"]):
+    for command in (["get", "arm.no"], ["set", "arm.no", "1"]):
         assert "no program has declared arm.no" in cli.error(3, *command)
     store["control"]["kp"] = 99
     assert "programs ignore the stored value: control.kp: 99" in cli.error(1, "get", "control.kp")
@@ -138,10 +138,10 @@ def test_what_no_program_declares_any_more_is_forgotten(cli, store):
     store["_parameters"].update({"a[0]": 5, "gone.p": {"type": "float"}})
     run = cli("list")
     assert (run.stdout.count("\n"), run.stderr.count("left out: ")) == (5, 2)
-    cli.result("forget", "a[0]", "gone.p", "control.kp")
+    for path in ("a[0]", "gone.p", "control.kp"):
+        CommandLine(cli.url, cli.namespace).result("del", f'_parameters["{path}"]')
     run = cli("list", "control")
     assert (run.stdout.count("\n"), run.stderr) == (2, "")
     assert store.get("control.kp") == 2.0
-    for name in ("control", "arm"):
-        cli.result("forget", *[path for path in store["_parameters"] if path.startswith(name)])
+    del store["_parameters"]
     assert "no program has declared a parameter" in cli.error(3, "list")

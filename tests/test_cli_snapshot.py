@@ -17,7 +17,6 @@ from conftest import assert_same, line_of
 import reem
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.snapshot import period
-from reem_async.tools.snapshots import files, portable
 
 
 def snapshot(*arguments, code=0, **changes):
@@ -185,29 +184,6 @@ def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
     kept = {os.path.basename(line["path"]) for line in lines[-2:]}
     assert set(names(tmp_path)) == kept | {mine, "reem-auto-20000101T000000Z.zip"}
     assert all(re.fullmatch(r"reem-auto-\d{8}T\d{6}Z(-\d+)?\.zip", name) for name in kept)
-
-
-def test_one_named_by_time_takes_the_next_number_if_another_program_has_the_name(kvs, env, tmp_path, monkeypatch):
-    """Which had begun in the same second: one of the two was lost, and both said that they had saved."""
-    kvs["foo"] = 1
-    named, survey, given = files.new_name, portable.survey, []
-
-    def new_name(*words, **options):
-        given.append(named(*words, **options))
-        return given[-1]
-
-    async def meanwhile(*words):
-        if len(given) == 1:
-            given[0].write_text("another program's")
-        return await survey(*words)
-
-    monkeypatch.setattr("reem_async.tools.cli.snapshot.new_name", new_name)
-    monkeypatch.setattr(portable, "survey", meanwhile)
-    said, errors = snapshot("save", "-d", tmp_path, "--force", **env)
-    assert said.startswith(f"{given[1]}: ")
-    assert errors == ""
-    assert given[0].read_text() == "another program's"
-    assert names(tmp_path) == sorted(path.name for path in given)
 
 
 def test_what_cannot_be_deleted_does_not_make_it_unsaved(kvs, env, tmp_path, monkeypatch):

@@ -17,8 +17,7 @@ from clikit import REEM
 from conftest import eventually
 
 import reem
-from reem_async.tools.demo.robot import place_of
-from reem_async.tools.demo.scene import BALL_RADIUS, REACH, Camera, angles_to, points_of
+from reem_async.tools.demo import BALL_RADIUS, REACH, Camera, angles_to, place_of, points_of
 
 
 @contextlib.contextmanager
@@ -46,7 +45,7 @@ def demo(**environment):
 
 def programs(port):
     found = subprocess.run(["ps", "-axwwo", "args"], capture_output=True, text=True, check=True).stdout
-    return [line for line in found.splitlines() if "demo.robot" in line and line.endswith(f":{port}")]
+    return [line for line in found.splitlines() if "tools.demo" in line and line.endswith(f":{port}")]
 
 
 @pytest.mark.parametrize("plain", ["0", pytest.param("1", marks=pytest.mark.long)])

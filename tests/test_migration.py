@@ -19,7 +19,7 @@ import reem_async
 from reem.migration import migrate
 from reem_async import migration
 from reem_async.errors import BadData, BadType, NotAllowed
-from reem_async.legacy.values import array_of
+from reem_async.legacy.convert import array_of
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.options import ship_named
 

@@ -14,7 +14,7 @@ from reem_async.plan.paths import check_element, to_jsonpath
 from reem_async.server import EmbeddedServer
 from reem_async.store.catalog import outline
 from reem_async.tools.browser.partial_reads import keys_at, peek
-from reem_async.tools.recording.key_reader import fetch
+from reem_async.tools.recording.key_recorder import fetch
 
 # U+4E00, U+AC00, U+0100, U+1F600, U+10000: at code points that end in 00 the RedisJSON module has died.
 ODD = ["", "\0", "\x01", "\n", "\r", "\t", " ", "\x7f", "\xa0", "Ā", "\u2028", "一", "가", "\ufeff", "😀", "\U00010000"]

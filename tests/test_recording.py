@@ -17,7 +17,7 @@ import reem_async
 from reem_async.errors import BadInput, BadKey, BadValue, MissingKey
 from reem_async.pubsub.manager import manager_of
 from reem_async.tools.recording import ArrayHandle, Recorder, Replayer, open_log
-from reem_async.tools.recording.key_reader import KeyReader
+from reem_async.tools.recording.key_recorder import KeyReader
 from reem_async.tools.recording.recorder import _TICK
 from reem_async.tools.recording.times import HURRIED, PATIENCE
 

@@ -19,12 +19,11 @@ from reem_async.errors import BadData, BadInput, BadValue
 from reem_async.plan.paths import parse_pattern
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.tools.recording.contents import Content
 from reem_async.tools.recording.layout import decode, encode, from_json, schema_bytes, to_json
 from reem_async.tools.recording.log import stacked
 from reem_async.tools.recording.sample import read_key_file
-from reem_async.tools.recording.sink import OPEN, fits, schema_text, signature
-from reem_async.tools.recording.stored import Reference, extract, planted, pruned, resolve
+from reem_async.tools.recording.sink import OPEN, fits, schema_of
+from reem_async.tools.recording.stored import Content, Reference, extract, planted, pruned, resolve
 from reem_async.tools.recording.times import AFTER, STEP, nanoseconds, seconds
 from reem_async.transport.protocol import CommandRecorder
 
@@ -223,18 +222,17 @@ def test_a_value_of_an_unknown_ship_names_it():
 
 
 def test_a_schema_fits_until_a_type_changes():
-    known = signature({"a": 1, "b": {"c": "x"}, "l": [1.5, 2]})
+    known = schema_of({"a": 1, "b": {"c": "x"}, "l": [1.5, 2]})
     for fitting in ({"a": 2.5}, {"b": {"c": "", "d": 1}, "new": 1}, {"a": None}, {"l": []}, {"l": [1]}, {}):
-        assert fits(signature(fitting), known)
-        assert fits(signature(fitting), OPEN)
+        assert fits(schema_of(fitting), known)
+        assert fits(schema_of(fitting), OPEN)
     for other in ({"a": "1"}, {"a": True}, {"b": 1}, {"l": ["x"]}, {"l": {}}, {"b": {"c": 1}}):
-        assert not fits(signature(other), known)
-        assert fits(signature(other), OPEN)
+        assert not fits(schema_of(other), known)
+        assert fits(schema_of(other), OPEN)
 
 
 def test_a_schema_is_one_that_viewers_take():
-    text = schema_text("reem.a", signature({"n": 1, "s": "", "o": {"x": None}, "l": [{"y": True}], "mixed": [1, ""]}))
-    schema = orjson.loads(text)
+    schema = schema_of({"n": 1, "s": "", "o": {"x": None}, "l": [{"y": True}], "mixed": [1, ""]})
     assert schema["type"] == "object"
 
     def check(node):

@@ -16,9 +16,10 @@ from snapshotkit import everything, left_in
 import reem_async
 import reem_async.snapshots
 from reem_async.errors import BadData
-from reem_async.tools.snapshots import describe, restore, save
+from reem_async.tools.cli.snapshot import prune
+from reem_async.tools.snapshots import describe, described, restore, save
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
-from reem_async.tools.snapshots.files import new_name, prune
+from reem_async.tools.snapshots.files import new_name
 from reem_async.tools.snapshots.plans import KeyContent, Value, joined, split
 
 servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.here, snapshotkit.there
@@ -210,7 +211,7 @@ async def test_killed_it_leaves_nothing_under_the_name(servers, here, raws, tmp_
 
 
 def test_names_say_when_and_pruning_deletes_only_its_own(tmp_path):
-    """By the order of this run, not by the clock; never the newest, nor files of other names, kinds or content."""
+    """The oldest, by when they were written; never the newest, nor files of other names, kinds or content."""
     entry = KeyContent("foo", b"1", (), ())
     first = new_name(tmp_path, "portable", 0.0, auto=True)
     assert first.name == "reem-auto-19700101T000000Z.zip"
@@ -228,9 +229,9 @@ def test_names_say_when_and_pruning_deletes_only_its_own(tmp_path):
     made = []
     for _ in range(4):  # the clock has lost its time: all are of 1970
         made.append(written(new_name(tmp_path, "portable", 0.0, auto=True), entry))
-        prune(made, 3)
+        prune(described(made[-1]), 3)
         made = made[-3:]
     assert [path.name for path in made] == [f"reem-auto-19700101T000000Z-{number}.zip" for number in (2, 3, 4)]
     assert left_in(tmp_path) == sorted(path.name for path in made + others)
     assert not any(path.exists() for path in earlier)
-    assert prune(made[-1:], 1) == (made[:2], [])
+    assert prune(described(made[-1]), 1) == made[:2]

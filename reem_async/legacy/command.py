@@ -9,24 +9,18 @@ import typer
 from reem_async.connection import RedisInterface
 from reem_async.legacy import convert
 from reem_async.legacy.convert import Migration
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
+from reem_async.tools.cli.options import AsJson, Match, with_server
 from reem_async.tools.cli.output import clean, columns, counted, emit, emit_json, named, note, progress_bar
-from reem_async.tools.cli.running import FAILED, guarded, run
+from reem_async.tools.cli.running import FAILED
 
 
-def migrate(
+@with_server("migrate", ships=True)
+async def migrate(
+    interface: RedisInterface,
     yes: Annotated[bool, typer.Option("--yes", help="Convert. Without it, only show what would be done.")] = False,
-    ships: Ships = None,
-    match: Annotated[
-        str,
-        typer.Option(
-            "--match", metavar="PATTERN", help="Only the top-level keys that match; * and ? stand for other characters."
-        ),
-    ] = "*",
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
+    match: Match = "*",
     as_json: AsJson = False,
-) -> None:
+) -> int:
     """Convert data of REEM 0.1 or older, or of a server without JSON, in place.
 
     Without --yes everything is read and checked, and nothing is changed. End the programs of old versions
@@ -40,17 +34,11 @@ def migrate(
         reem migrate --yes
         reem migrate --yes --ship my_ships:PoseShip --url redis://robot.local:6379
     """
-    with guarded("migrate"):
-        given = named_ships(ships)
-
-    async def work(interface: RedisInterface) -> int:
-        with progress_bar(after=0.0) as bar:
-            tell = None if as_json else bar("convert" if yes else "check")
-            done = await convert.migrate(interface, match, dry_run=not yes, progress=tell)
-        _show(done, as_json)
-        return FAILED if done.problems else 0
-
-    run("migrate", work, url, namespace, ships=given)
+    with progress_bar(after=0.0) as bar:
+        tell = None if as_json else bar("convert" if yes else "check")
+        done = await convert.migrate(interface, match, dry_run=not yes, progress=tell)
+    _show(done, as_json)
+    return FAILED if done.problems else 0
 
 
 def _show(done: Migration, as_json: bool) -> None:

@@ -17,16 +17,14 @@ from __future__ import annotations
 
 import base64
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
+import orjson
 
 
 def json_text(value: Any, *, pretty: bool = False) -> str:
     """Return a value as JSON, in one line, or indented if `pretty`; it may contain half of a surrogate pair."""
-    import orjson
-
     plain = _plain(value)
     try:
         text = orjson.dumps(plain, option=orjson.OPT_INDENT_2 if pretty else None).decode()
@@ -46,8 +44,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if hasattr(value, "dtype"):
-        import numpy as np
-
         return _listed(np.asarray(value))
     if value is None or isinstance(value, str | int | float):
         return value
@@ -56,8 +52,6 @@ def _plain(value: Any) -> Any:
 
 def _listed(array: np.ndarray[Any, Any]) -> Any:
     """Return an array as nested lists, one without axes as a single value."""
-    import numpy as np
-
     kind = array.dtype.kind
     if array.dtype.names is not None:
         return _rows(array)
@@ -75,8 +69,6 @@ def _listed(array: np.ndarray[Any, Any]) -> Any:
 
 
 def _rows(array: np.ndarray[Any, Any]) -> Any:
-    import numpy as np
-
     items = array.reshape(-1)
     rows = np.empty(items.size, object)
     for place, row in enumerate(zip(*[_listed(items[name]) for name in array.dtype.names or ()], strict=True)):
@@ -85,8 +77,6 @@ def _rows(array: np.ndarray[Any, Any]) -> Any:
 
 
 def _durations(array: np.ndarray[Any, Any]) -> Any:
-    import numpy as np
-
     unit, step = np.datetime_data(array.dtype)
     ending = "" if unit == "generic" else f" {unit}"
     texts = np.empty(array.shape, object)

@@ -10,6 +10,7 @@ import re
 import secrets
 import stat
 from pathlib import Path
+from typing import Self
 
 _NAME = re.compile(r"\..*\.[0-9a-f]{8}\.reem\.part", re.DOTALL)
 _LONGEST = 200
@@ -56,7 +57,8 @@ class PartFile:
     If `target` is a link, it stays one, and the file gets the name that it leads to. With `replace` it may take the
     place of a file of that name, and is readable by nobody who could not read that one.
 
-    Making one removes those in the same directory whose program was killed.
+    A context manager that finishes it at the end of the block, or removes it where the block fails. Making one removes
+    those in the same directory whose program was killed.
     """
 
     def __init__(self, target: Path, *, replace: bool = False) -> None:
@@ -94,8 +96,17 @@ class PartFile:
         self.path = self._target
 
     def finish(self) -> None:
-        """Give the file its name, and close it; raises as `appear` does."""
+        """Give the file its name once all of it is on the disk, and close it; raises as `appear` does."""
+        # First the content, then the name: after a power failure there is never a name with half a file.
+        os.fsync(self.descriptor)
         self.appear()
+        # Make the new name survive a power failure too, where directories can be opened.
+        with contextlib.suppress(OSError):
+            directory = os.open(self.path.parent, os.O_RDONLY)
+            try:
+                os.fsync(directory)
+            finally:
+                os.close(directory)
         self.close()
 
     def close(self) -> None:
@@ -106,6 +117,16 @@ class PartFile:
         if self.descriptor >= 0:
             os.close(self.descriptor)
             self.descriptor = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if kind is None:
+                self.finish()
+        finally:
+            self.close()
 
     def __del__(self) -> None:
         if self.descriptor >= 0:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
-import os
 import sys
 from typing import TYPE_CHECKING
 
-from reem_async._installation import CURE, original_reem
+from ..._installation import CURE, original_reem
 
 if TYPE_CHECKING:
     import typer
@@ -17,8 +15,8 @@ __all__ = ["build", "main"]
 
 def main() -> None:
     """Run the command line; exit code 1 and the remedy if what it needs is not installed."""
-    # Before anything is printed: a shell may have closed a stream (`>&-`), and print would fail later.
-    _mend_streams()
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr] # shows what the terminal cannot
     if clash := original_reem():
         sys.stderr.write(f"reem: {clash}; run: {CURE}\n")
     try:
@@ -43,24 +41,12 @@ def main() -> None:
         raise SystemExit(1) from None
 
 
-def _mend_streams() -> None:
-    """Have all three streams, whatever the shell has closed; show characters that a terminal does not know as codes."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        stream = getattr(sys, name)
-        if stream is None:
-            stream = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115 - until the program ends
-            atexit.register(stream.close)
-            setattr(sys, name, stream)
-        elif mode == "w":
-            stream.reconfigure(errors="backslashreplace")
-
-
 def build() -> typer.Typer:
     """The command line, put together here so that nothing is imported before it is known to be there."""
     import rich  # noqa: F401 - needed only later, by the command; said at once if it is missing
     import typer
 
-    from reem_async.tools.cli.commands import COMMANDS, group_of, root
+    from .commands import COMMANDS, group_of, root
 
     # Pretty tracebacks are off: they show the values of variables, and one is a password.
     app = typer.Typer(

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from reem_async.concurrency.tasks import stand_back
-from reem_async.connection import RedisInterface
-from reem_async.errors import ServerFailed
-from reem_async.server import EmbeddedServer
-from reem_async.tools.cli.checks import is_loopback
-from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
-from reem_async.tools.cli.output import clean, emit, facts_lines, styled
-from reem_async.tools.cli.running import USAGE, CommandFailed, interface_to, run_local
+from ...concurrency.tasks import stand_back
+from ...connection import RedisInterface
+from ...errors import ServerFailed
+from ...server import EmbeddedServer
+from .checks import is_loopback
+from .options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
+from .output import clean, emit, facts_lines, styled
+from .running import USAGE, CommandFailed, interface_to, run_local
 
 if TYPE_CHECKING:
-    from reem_async.tools.browser import Source
+    from ..browser import Source
 
 _PACKAGES = {"starlette": "starlette", "uvicorn": "uvicorn", "PIL": "pillow"}
 _MEGABYTE = 1 << 20
@@ -41,14 +41,10 @@ def browse(
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
     log: Annotated[
-        Path | None,
-        typer.Option(
-            "--log", metavar="FILE", callback=existing, dir_okay=False, help="Show this recording in place of a server."
-        ),
+        Path | None, typer.Option("--log", metavar="FILE", callback=existing, dir_okay=False, help="Show a recording.")
     ] = None,
     host: Annotated[
-        str,
-        typer.Option(metavar="ADDRESS", help="Where to listen; with any but this machine's own, a token is needed."),
+        str, typer.Option(metavar="ADDRESS", help="Where to listen; other machines need a token.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the page; 0 takes a free one.")] = 8080,
     buffer: Annotated[
@@ -98,18 +94,18 @@ def check_packages(log: Path | None) -> None:
 def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: int, ships: list[Any]) -> Source:
     """Return what to show. Made outside of the event loop, in which it is used."""
     if log is not None:
-        from reem_async.tools.browser.logsource import LogSource
+        from ..browser.logsource import LogSource
 
         return LogSource(log, ships)
-    from reem_async.tools.browser import LiveSource
+    from ..browser import LiveSource
 
     interface = interface_to(url, namespace, ships=ships)
     return LiveSource(interface, buffer, memory * _MEGABYTE)
 
 
 async def _serve(source: Source, host: str, port: int, allow_write: bool, open_: bool) -> None:
-    from reem_async.tools.browser import PageServer, create_app, listen
-    from reem_async.tools.browser.app import LOOPBACK, own_names
+    from ..browser import PageServer, create_app, listen
+    from ..browser.app import LOOPBACK, own_names
 
     # Reachable from this machine only: then the name in the request is checked, and no token is needed. From others
     # a token is, and the name may be any of this machine's.
@@ -141,7 +137,7 @@ def open_page(address: str) -> None:
 
 
 def _address(host: str, port: int, token: str | None) -> str:
-    from reem_async.tools.browser.app import own_address
+    from ..browser.app import own_address
 
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
         host = own_address(host)
@@ -158,18 +154,14 @@ def _tell(source: Source, address: str, alone: bool, allow_write: bool) -> None:
 
 def demo(
     port: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, show_default="6379, or a free one if it is taken", help="TCP port of the server."
-        ),
+        int | None, typer.Option(min=0, max=65535, show_default="6379, or a free one", help="TCP port of the server.")
     ] = None,
     page_port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, show_default="8080, or a free one if it is taken", help="TCP port of the page."),
+        int | None, typer.Option(min=0, max=65535, show_default="8080, or a free one", help="TCP port of the page.")
     ] = None,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a web browser.")] = True,
 ) -> None:
-    """Start a simulated robot and show it on a page in the web browser, until Ctrl-C.
+    """Start a simulated robot and show it on a page, until Ctrl-C.
 
     Three programs share one server: an arm, a camera that sees it, and a controller that finds a ball in the
     camera's picture and carries it to a goal. The command prints three lines of Python that move the goal from
@@ -207,7 +199,7 @@ def _first_of(wanted: int | None, usual: int, start: Any) -> Any:
 
 @contextmanager
 def _programs(url: str) -> Iterator[None]:
-    command = [sys.executable, "-m", "reem_async.tools.demo.robot"]
+    command = [sys.executable, "-m", "reem_async.tools.demo"]
     # In a session of their own: Ctrl-C is for this command, which then ends them.
     running = [
         subprocess.Popen([*command, name, url], stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603 - our own
@@ -228,7 +220,7 @@ def _programs(url: str) -> Iterator[None]:
 
 
 async def _show(server_port: int, page_port: int | None, open_: bool) -> None:
-    from reem_async.tools.browser import LiveSource, PageServer, create_app, listen
+    from ..browser import LiveSource, PageServer, create_app, listen
 
     source = LiveSource(RedisInterface(f"redis://localhost:{server_port}", timeout=5.0))
     sock = _first_of(page_port, _PAGE_PORT, lambda number: listen("127.0.0.1", number))

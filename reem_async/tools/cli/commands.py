@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from reem_async import __version__
+from ... import __version__
 
 # The headings of `reem --help`, in this order.
 SERVER, LOOK, CHANGE, LIVE, LOG = "Server", "Look", "Change", "Live", "Record and browse"
@@ -35,25 +35,19 @@ class Entry(NamedTuple):
 
 COMMANDS = (
     Entry("up", "up", "up", SERVER, "Start a private server and keep it up until Ctrl-C."),
-    Entry(
-        "demo",
-        "browse",
-        "demo",
-        SERVER,
-        "Start a simulated robot and show it on a page in the web browser, until Ctrl-C.",
-    ),
+    Entry("demo", "browse", "demo", SERVER, "Start a simulated robot and show it on a page, until Ctrl-C."),
     Entry("doctor", "doctor", "doctor", SERVER, "Check server, connection and installation, and say what to do."),
     Entry("migrate", "legacy.command", "migrate", SERVER, "Convert data of REEM 0.1 or older, in place."),
     Entry("ls", "listing", "ls", LOOK, "List keys with type and size."),
     Entry("tree", "listing", "tree", LOOK, "Show what is below keys; arrays are not fetched."),
     Entry("get", "values", "get", LOOK, "Print a value, or write it to a file."),
-    Entry("nodes", "nodes", "nodes", LOOK, "List the programs that are connected under a name."),
+    Entry("nodes", "programs", "nodes", LOOK, "List the programs that are connected under a name."),
     Entry("set", "values", "set_", CHANGE, "Store a value.", takes_minus=True),
     Entry("del", "values", "delete", CHANGE, "Delete a value."),
     Entry("pub", "values", "pub", CHANGE, "Publish a value, once or at a rate.", takes_minus=True),
     Entry("param", "param", "app", CHANGE, "List, set, save and load parameters, within their bounds."),
-    Entry("services", "services", "services", LOOK, "List the services, with what each of their servers says."),
-    Entry("call", "services", "call", CHANGE, "Call a service, and print its answer."),
+    Entry("services", "programs", "services", LOOK, "List the services, with what each of their servers says."),
+    Entry("call", "programs", "call", CHANGE, "Call a service, and print its answer."),
     Entry("echo", "echo", "echo", LIVE, "Print changes as they are published or stored."),
     Entry("top", "top", "top", LIVE, "Show what is published and served: live tables of keys and services."),
     Entry("hz", "top", "hz", LIVE, "Measure how often paths are published or stored."),

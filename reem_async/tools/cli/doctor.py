@@ -14,24 +14,24 @@ from typing import Annotated, Any
 
 import typer
 
-from reem_async._installation import CURE, original_reem
-from reem_async.connection import RedisInterface
-from reem_async.errors import BadKey, NoJsonSupport, RedisError, ReemError
-from reem_async.legacy.finding import find
-from reem_async.local.segment import Segment, reason_against
-from reem_async.plan.attachments import orphans, remove_orphans
-from reem_async.plan.paths import check_top_key, parse_suffix
-from reem_async.plan.sizes import STAGED
-from reem_async.session import Session
-from reem_async.ships.images import codecs
-from reem_async.tools.cli import checks
-from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
-from reem_async.tools.cli.following import follow
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
-from reem_async.tools.cli.output import clean, emit, emit_json, is_terminal, styled, width
-from reem_async.tools.cli.running import FAILED, for_users, interface_to, run_local
-from reem_async.tools.cli.top import ALL, Board
-from reem_async.transport import Transport, scanned
+from ..._installation import CURE, original_reem
+from ...connection import RedisInterface
+from ...errors import BadKey, NoJsonSupport, RedisError, ReemError
+from ...legacy.convert import find
+from ...local.segment import Segment, reason_against
+from ...plan.attachments import orphans, remove_orphans
+from ...plan.paths import check_top_key, parse_suffix
+from ...plan.sizes import STAGED
+from ...session import Session
+from ...ships.images import codecs
+from ...transport import Transport, scanned
+from . import checks
+from .checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
+from .following import follow
+from .options import DEFAULT_URL, AsJson, Namespace, Url
+from .output import clean, emit, emit_json, is_terminal, styled, width
+from .running import FAILED, for_users, interface_to, run_local
+from .top import ALL, Board
 
 _ROUND_TRIPS = 200  # enough for a 99th percentile that is not the slowest one alone
 _MOST_SECONDS = 2.0  # over a slow network there are fewer
@@ -163,7 +163,7 @@ async def _of_server(interface: RedisInterface, server: Transport) -> AsyncItera
     info, config, user, kind = await server.roundtrip(
         [
             ("INFO",),
-            ("CONFIG", "GET", "client-output-buffer-limit", "save"),
+            ("CONFIG", "GET", "save"),
             ("ACL", "WHOAMI"),
             ("JSON.GET",),  # an error: it shows whether the server knows the command
         ]
@@ -184,7 +184,7 @@ async def _of_server(interface: RedisInterface, server: Transport) -> AsyncItera
         yield finding
     yield await _latency(server)
     yield await _clock(server)
-    for check in (checks.memory, checks.eviction, checks.subscribers, checks.persistence):
+    for check in (checks.memory, checks.eviction, checks.persistence):
         yield check(facts)
 
 

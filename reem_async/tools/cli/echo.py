@@ -11,30 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from reem_async.connection import RedisInterface
-from reem_async.errors import MissingKey, RedisError, ReemError
-from reem_async.plan.paths import Path, Pattern, parse_pattern, spelled_out
-from reem_async.plan.placeholders import Unfetched
-from reem_async.plan.trees import MISSING, get, mapped
-from reem_async.pubsub.monitor import ANNOUNCED, Event
-from reem_async.store.catalog import outline
-from reem_async.tools.cli.following import Ending, follow
-from reem_async.tools.cli.listing import as_data, describe, found
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
-from reem_async.tools.cli.output import (
-    clean,
-    cut,
-    emit,
-    emit_json,
-    is_terminal,
-    json_text,
-    note,
-    size_text,
-    styled,
-    typed,
-    width,
-)
-from reem_async.tools.cli.running import run
+from ...connection import RedisInterface
+from ...errors import MissingKey, RedisError, ReemError
+from ...plan.paths import Path, Pattern, parse_pattern, spelled_out
+from ...plan.placeholders import Unfetched
+from ...plan.trees import MISSING, get, mapped
+from ...pubsub.monitor import ANNOUNCED, Event
+from ...store.catalog import outline
+from .following import Ending, follow
+from .listing import as_data, describe, found
+from .options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
+from .output import clean, cut, emit, emit_json, is_terminal, json_text, note, size_text, styled, typed, width
+from .running import run
 
 
 def echo(

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from reem_async.errors import BadValue
-from reem_async.tools.cli.options import AsJson, Force, Only, Recording
-from reem_async.tools.cli.output import clean, counted, emit, emit_json, note, progress_bar, size_text
-from reem_async.tools.cli.running import run_local
+from ...errors import BadValue
+from .options import AsJson, Force, Only, Recording
+from .output import clean, counted, emit, emit_json, note, progress_bar, size_text
+from .running import run_local
 
 if TYPE_CHECKING:
-    from reem_async.tools.recording.training import ExportedEpisode, TrainingSet
+    from ..recording.training import ExportedEpisode, TrainingSet
 
 _STDOUT = Path("-")
 _TRAINING = "Training sets"
@@ -108,8 +108,8 @@ def export(
     """
 
     def work() -> int:
-        from reem_async.tools.recording import open_log
-        from reem_async.tools.recording.training import TrainingSet, export_training
+        from ..recording import open_log
+        from ..recording.training import TrainingSet, export_training
 
         if rate is None:
             if state or action or image:
@@ -182,9 +182,9 @@ def _line(each: ExportedEpisode) -> str:
 def _table(
     file: Path, patterns: list[str] | None, to: str | None, output: Path | None, *, force: bool, as_json: bool
 ) -> int:
-    from reem_async.tools.recording import open_log
-    from reem_async.tools.recording.export import FORMATS
-    from reem_async.tools.recording.export import export as write
+    from ..recording import open_log
+    from ..recording.export import FORMATS
+    from ..recording.export import export as write
 
     kind, to_stdout = _format(to, output, tuple(FORMATS)), output == _STDOUT
     if to_stdout and as_json:

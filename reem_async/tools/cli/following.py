@@ -10,15 +10,15 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from reem_async.concurrency.queues import Last
-from reem_async.connection import RedisInterface
-from reem_async.errors import ReemError
-from reem_async.plan.notices import LARGEST_INLINE
-from reem_async.plan.paths import parse_shown
-from reem_async.pubsub.monitor import Event, Monitor
-from reem_async.pubsub.pattern_watch import PatternWatch
-from reem_async.tools.cli.output import counted, emit_json, note, write_over
-from reem_async.tools.cli.running import TIMED_OUT
+from ...concurrency.queues import Last
+from ...connection import RedisInterface
+from ...errors import ReemError
+from ...plan.notices import LARGEST_INLINE
+from ...plan.paths import parse_shown
+from ...pubsub.monitor import Event, Monitor
+from ...pubsub.pattern_watch import PatternWatch
+from .output import counted, emit_json, note, write_over
+from .running import TIMED_OUT
 
 _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""

@@ -8,12 +8,12 @@ from typing import Annotated, Any
 
 import typer
 
-from reem_async.connection import RedisInterface
-from reem_async.errors import BadData, MissingKey, WrongKind
-from reem_async.plan.paths import check_top_key, parse, parse_pattern
-from reem_async.store.catalog import Outline, names, outline
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url, complete_path
-from reem_async.tools.cli.output import (
+from ...connection import RedisInterface
+from ...errors import BadData, MissingKey, WrongKind
+from ...plan.paths import check_top_key, parse, parse_pattern
+from ...store.catalog import Outline, names, outline
+from .options import DEFAULT_URL, AsJson, Namespace, Url, complete_path
+from .output import (
     clean,
     columns,
     counted,
@@ -28,7 +28,7 @@ from reem_async.tools.cli.output import (
     typed,
     width,
 )
-from reem_async.tools.cli.running import NOTHING, for_users, run
+from .running import NOTHING, for_users, run
 
 # Entries that are drawn of one dict or list: lists of thousands of numbers would fill the screen.
 _MOST_CHILDREN = 50

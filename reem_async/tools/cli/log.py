@@ -13,30 +13,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from reem_async.connection import RedisInterface
-from reem_async.tools.cli.export import export
-from reem_async.tools.cli.following import progress
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Only, Recording, Url
-from reem_async.tools.cli.output import (
-    clean,
-    columns,
-    emit,
-    emit_json,
-    figures,
-    progress_bar,
-    size_text,
-    styled,
-)
-from reem_async.tools.cli.running import USAGE, CommandFailed, run, run_local
+from ...connection import RedisInterface
+from .export import export
+from .following import progress
+from .options import AsJson, Only, Recording, with_server
+from .output import clean, columns, emit, emit_json, figures, progress_bar, size_text, styled
+from .running import USAGE, CommandFailed, run_local
 
 if TYPE_CHECKING:
-    from reem_async.tools.recording import ChannelSummary, Log, Replayer, ReplayStatus
+    from ..recording import ChannelSummary, Log, Replayer, ReplayStatus
 
 _NOTICED_LAG = 0.1
 """Seconds behind the pace that are worth a word."""
 
 
-def play(
+@with_server("play", live=True)
+async def play(
+    interface: RedisInterface,
     file: Recording,
     patterns: Only = None,
     rate: Annotated[
@@ -52,9 +45,7 @@ def play(
         list[str] | None, typer.Option(metavar="OLD=NEW", help="Another name for a top-level key; may be repeated.")
     ] = None,
     as_json: AsJson = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
+) -> int:
     """Publish a recording again, at the pace at which it was recorded.
 
     First the state at the start is published, then every update in its turn, bit for bit.
@@ -66,36 +57,32 @@ def play(
         reem play run.mcap --start 12.5 --rate 0.5 --loop
         reem play run.mcap 'cam_*' --remap cam_left=camera
     """
+    from ..recording import Replayer, open_log
 
-    async def work(interface: RedisInterface) -> int:
-        from reem_async.tools.recording import Replayer, open_log
-
-        names = dict(_pair(text) for text in remap or ())
-        with open_log(file) as log:
-            replayer = Replayer(
-                interface,
-                log,
-                rate=rate,
-                start=log.start + start,
-                end=None if end is None else log.start + end,
-                loop=loop,
-                patterns=patterns or ["*"],
-                remap=names,
-            )
-            try:
-                if step:
-                    await _step(replayer, log, as_json)
-                else:
-                    async with progress(
-                        lambda: _progress(replayer), lambda: figures(replayer.status, 6), 0.1, as_json=as_json
-                    ):
-                        await replayer.play()
-            finally:
-                _end(replayer.status, file, as_json)
-            # What is damaged is left out and the rest is played; the exit code tells scripts.
-            return 1 if replayer.status.unreadable else 0
-
-    run("play", work, url, namespace, live=True)
+    names = dict(_pair(text) for text in remap or ())
+    with open_log(file) as log:
+        replayer = Replayer(
+            interface,
+            log,
+            rate=rate,
+            start=log.start + start,
+            end=None if end is None else log.start + end,
+            loop=loop,
+            patterns=patterns or ["*"],
+            remap=names,
+        )
+        try:
+            if step:
+                await _step(replayer, log, as_json)
+            else:
+                async with progress(
+                    lambda: _progress(replayer), lambda: figures(replayer.status, 6), 0.1, as_json=as_json
+                ):
+                    await replayer.play()
+        finally:
+            _end(replayer.status, file, as_json)
+        # What is damaged is left out and the rest is played; the exit code tells scripts.
+        return 1 if replayer.status.unreadable else 0
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -187,7 +174,7 @@ def info(
     """
 
     def work() -> int:
-        from reem_async.tools.recording import open_log
+        from ..recording import open_log
 
         with ExitStack() as stack:
             with progress_bar() as bar:

@@ -5,21 +5,23 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from importlib import import_module
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from reem_async.errors import BadType, BadValue, ReemError
-from reem_async.plan.paths import parse, shorten
-from reem_async.ships.base import SpecialDatatypeShip
-from reem_async.ships.registry import default_ships
-from reem_async.store.catalog import names
-from reem_async.store.store import KeyValueStore
-from reem_async.tools.cli.output import typed
-from reem_async.tools.cli.running import NOTHING, complain, interface_to
+from ...errors import BadType, BadValue, ReemError
+from ...plan.paths import parse, shorten
+from ...ships.base import SpecialDatatypeShip
+from ...ships.registry import default_ships
+from ...store.catalog import names
+from ...store.store import KeyValueStore
+from .output import typed
+from .running import NOTHING, complain, guarded, interface_to, run
 
 _SECONDS = 1.0  # longer than this, a completion only disturbs
 # Names that are offered: a shell asks before it shows more than about a hundred.
@@ -105,6 +107,12 @@ Patterns = Annotated[
         help="Paths; * and ? stand for other characters of a key: cam_*, robot.*.battery. All if there is none.",
     ),
 ]
+Match = Annotated[
+    str,
+    typer.Option(
+        "--match", metavar="PATTERN", help="Only the top-level keys that match; * and ? stand for other characters."
+    ),
+]
 Value = Annotated[
     str,
     typer.Argument(
@@ -115,9 +123,10 @@ Value = Annotated[
 Text = Annotated[bool, typer.Option("--str", help="VALUE is text, not JSON; - still reads the input.")]
 Publish = Annotated[bool, typer.Option("--publish", help="Notify subscribers, as a PublishSpace does.")]
 Recording = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
-Only = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
+Only = Annotated[list[str] | None, typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths.")]
+Output = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="FILE", help="Write it to a file: .npy, .npz, .json, .png or .bin."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it is there already.")]
 
@@ -139,6 +148,33 @@ Timeout = Annotated[
         help="End after so long; exit code 4 if there were fewer than --count updates by then, or none.",
     ),
 ]
+
+
+def with_server(
+    name: str, *, live: bool = False, ships: bool = False
+) -> Callable[[Callable[..., Coroutine[Any, Any, int | None]]], Callable[..., None]]:
+    """Make a command of a function that takes an interface, and returns what to await once that is connected.
+
+    The command has the options --url and --namespace besides those of the function, and with `ships` also --ship.
+    """
+
+    def decorate(work: Callable[..., Coroutine[Any, Any, int | None]]) -> Callable[..., None]:
+        def command(url: str, namespace: str, own: list[str] | None = None, **given: Any) -> None:
+            with guarded(name):
+                known = named_ships(own) if ships else None
+            run(name, lambda interface: work(interface, **given), url, namespace, live=live, ships=known)
+
+        added = [("url", Url, DEFAULT_URL), ("namespace", Namespace, ""), *([("own", Ships, None)] if ships else [])]
+        parameters = [
+            *list(signature(work, eval_str=True).parameters.values())[1:],
+            *[Parameter(title, Parameter.KEYWORD_ONLY, default=value, annotation=kind) for title, kind, value in added],
+        ]
+        command.__name__, command.__doc__ = work.__name__, work.__doc__
+        command.__annotations__ = {each.name: each.annotation for each in parameters}
+        command.__signature__ = Signature(parameters)  # type: ignore[attr-defined] # typer makes the options of it
+        return command
+
+    return decorate
 
 
 def named_ships(names: list[str] | None) -> list[Any]:

@@ -10,13 +10,14 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import typer
 
-from reem_async.plan.paths import suffix
-from reem_async.tools import jsontext
+from ...plan.paths import suffix
+from .. import jsontext
 
 # What moves the cursor, changes colours or breaks lines: keys and values come from anywhere.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -123,8 +124,9 @@ def columns(
     styles: Sequence[str],
     right: frozenset[int] = frozenset(),
     shrink: Sequence[int] = (0,),
+    heads: Sequence[str] = (),
 ) -> None:
-    """Print rows of clean cells: aligned and coloured on a terminal, separated by tabs elsewhere.
+    """Print rows of clean cells: on a terminal aligned, coloured and below their heads, elsewhere separated by tabs.
 
     Columns in `right` are numbers; those in `shrink` are cut on a narrow terminal, the widest first.
     """
@@ -139,7 +141,7 @@ def columns(
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
     for place, style in enumerate(styles):
         table.add_column(style=style, justify="right" if place in right else "left", no_wrap=place not in shrink)
-    for row in rows:
+    for row in [heads, *rows] if heads else rows:
         table.add_row(*[Text(cell, no_wrap=True, overflow="ellipsis") for cell in row])
     Console().print(table)
 
@@ -150,24 +152,19 @@ def progress_bar(after: float = 1.0) -> Iterator[Callable[[str], Callable[[int, 
 
     The bar begins `after` so many seconds, on a terminal only, and is gone at the end.
     """
-    begun = time.monotonic()
-    with ExitStack() as stack:
-        # None until it takes so long that a bar is worth showing; then one.
-        bars: list[tuple[Any, Any]] = []
-
-        def tell(doing: str, done: int, total: int) -> None:
-            if not bars and time.monotonic() - begun >= after and sys.stderr.isatty():
-                bars.append(_begin(stack))
-            for bar, task in bars:
-                bar.update(task, description=doing, completed=done, total=max(total, 1))
-
-        yield lambda doing: lambda done, total: tell(doing, done, total)
-
-
-def _begin(stack: ExitStack) -> tuple[Any, Any]:
+    if not sys.stderr.isatty():
+        yield lambda _: lambda _, __: None
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     parts = (TextColumn("{task.description:8}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    bar = stack.enter_context(Progress(*parts, console=Console(stderr=True), transient=True))
-    return bar, bar.add_task("")
+    begun = time.monotonic()
+    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", visible=False)
+
+        def tell(doing: str, done: int, total: int) -> None:
+            is_long = time.monotonic() - begun >= after
+            bar.update(task, visible=is_long, description=doing, completed=done, total=max(total, 1))
+
+        yield lambda doing: partial(tell, doing)

@@ -12,18 +12,17 @@ from typing import Annotated, Any
 import typer
 from yaml import AliasToken, SafeLoader, YAMLError, safe_dump, safe_load, scan
 
-from reem_async.connection import RedisInterface
-from reem_async.coordination.parameters import SPECIFICATIONS, StoredParameter, publish, stored_parameters
-from reem_async.coordination.specification import Specification, as_json
-from reem_async.errors import BadInput, MissingKey
-from reem_async.plan.paths import Path as KeyPath
-from reem_async.plan.paths import Pattern, parse, parse_patterns, show
-from reem_async.store.store import KeyValueStore
-from reem_async.tools.cli.commands import MinusCommand, help_text
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, PathArgument, Patterns, Url, existing
-from reem_async.tools.cli.output import clean, columns, counted, emit, emit_json, is_terminal, json_text, note, typed
-from reem_async.tools.cli.running import FAILED, NOTHING, USAGE, CommandFailed, run
-from reem_async.tools.partfile import PartFile
+from ...connection import RedisInterface
+from ...coordination.parameters import StoredParameter, publish, stored_parameters
+from ...coordination.specification import Specification, as_json
+from ...errors import BadInput
+from ...plan.paths import Path as KeyPath
+from ...plan.paths import Pattern, parse, parse_patterns, show
+from ..partfile import PartFile
+from .commands import MinusCommand, help_text
+from .options import AsJson, Force, PathArgument, Patterns, existing, with_server
+from .output import clean, columns, counted, emit, emit_json, json_text, note, typed
+from .running import FAILED, NOTHING, USAGE, CommandFailed
 
 app = typer.Typer(rich_markup_mode="rich", help="List, set, save and load parameters, within their bounds.")
 
@@ -32,9 +31,8 @@ _LARGEST = 1_000_000  # bytes of a file: each parameter takes a line or two
 File = Annotated[Path, typer.Argument(metavar="FILE", show_default=False, help="A YAML file.", callback=existing)]
 
 
-def list_(
-    patterns: Patterns = None, as_json: AsJson = False, url: Url = DEFAULT_URL, namespace: Namespace = ""
-) -> None:
+@with_server("param list")
+async def list_(interface: RedisInterface, patterns: Patterns = None, as_json: AsJson = False) -> int:
     """List parameters with value, default, range, unit and help.
 
     Those that programs have declared, also programs that have ended. Where the output is no terminal, tabs separate
@@ -47,28 +45,23 @@ def list_(
         reem param list
         reem param list 'control.*' --json
     """
-
-    async def work(interface: RedisInterface) -> int:
-        found = await _declared(interface, patterns)
-        rows = [_row(it) for it in found]
-        if as_json:
-            for it in found:
-                emit_json(_facts(it))
-        else:
-            if rows and is_terminal():
-                rows.insert(0, ["name", "value", "default", "range", "unit", "help"])
-            columns(rows, ["bold", "cyan", "", "", "", "dim"], shrink=(5, 3, 1, 2, 0))
-            for it in found:
-                if it.invalid:
-                    note(it.invalid)
-        if not found:
-            note("no program has declared a parameter" + (" that is named so" if patterns else ""))
-        return 0 if found else NOTHING
-
-    run("param list", work, url, namespace)
+    found = await _declared(interface, patterns)
+    if as_json:
+        for it in found:
+            emit_json(_facts(it))
+    else:
+        heads = ("name", "value", "default", "range", "unit", "help") if found else ()
+        columns(map(_row, found), ["bold", "cyan", "", "", "", "dim"], shrink=(5, 3, 1, 2, 0), heads=heads)
+        for it in found:
+            if it.invalid:
+                note(it.invalid)
+    if not found:
+        note("no program has declared a parameter" + (" that is named so" if patterns else ""))
+    return 0 if found else NOTHING
 
 
-def get(path: PathArgument, url: Url = DEFAULT_URL, namespace: Namespace = "") -> None:
+@with_server("param get")
+async def get(interface: RedisInterface, path: PathArgument) -> None:
     """Print the value of a parameter, the default if none is stored.
 
     Exit code 3 if no program has declared it, 1 if the stored value is out of range.
@@ -76,23 +69,19 @@ def get(path: PathArgument, url: Url = DEFAULT_URL, namespace: Namespace = "") -
     Examples:
         reem param get control.kp
     """
-
-    async def work(interface: RedisInterface) -> None:
-        it = await _one(interface, path)
-        if it.invalid:
-            raise CommandFailed(f"programs ignore the stored value: {it.invalid}")
-        emit(_shown(it.used))
-
-    run("param get", work, url, namespace)
+    it = await _one(interface, path)
+    if it.invalid:
+        raise CommandFailed(f"programs ignore the stored value: {it.invalid}")
+    emit(_shown(it.used))
 
 
-def set_(
+@with_server("param set")
+async def set_(
+    interface: RedisInterface,
     path: PathArgument,
     value: Annotated[
         str, typer.Argument(metavar="VALUE", help="A number, true, false, a list such as '[1, 2]', or text as it is.")
     ],
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
 ) -> None:
     """Publish a value of a parameter.
 
@@ -104,23 +93,19 @@ def set_(
         reem param set control.mode track
         reem param set control.offset '[0, -0.5]'
     """
-
-    async def work(interface: RedisInterface) -> None:
-        it = await _one(interface, path)
-        checked = it.specification.checked(it.name, _parsed(value, it.specification))
-        await publish(interface.session, it.path, checked)
-
-    run("param set", work, url, namespace)
+    it = await _one(interface, path)
+    checked = it.specification.checked(it.name, _parsed(value, it.specification))
+    await publish(interface.session, it.path, checked)
 
 
-def save(
+@with_server("param save")
+async def save(
+    interface: RedisInterface,
     file: Annotated[
         Path | None, typer.Argument(metavar="FILE", show_default=False, help="The file to make; printed without it.")
     ] = None,
     force: Force = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
+) -> int:
     """Save the values of parameters as YAML, with their ranges as comments.
 
     The default is saved where nothing is stored. Values out of range are left out and named; the exit code is 1 then.
@@ -129,34 +114,26 @@ def save(
         reem param save tuned.yaml
         reem param save > tuned.yaml
     """
-
-    async def work(interface: RedisInterface) -> int:
-        found = await _declared(interface, None)
-        text = "".join(_yaml(it) for it in found if not it.invalid)
-        if file is None:
-            sys.stdout.write(text)
-        else:
-            part = PartFile(file, replace=force)
-            try:
-                part.path.write_text(text, encoding="utf-8")
-                part.finish()
-            finally:
-                part.close()
-        invalid = [it for it in found if it.invalid]
-        for it in invalid:
-            note(f"not saved: {it.invalid}")
-        if file is not None:
-            note(f"{file}: {counted(len(found) - len(invalid), 'parameter')}")
-        return FAILED if invalid else 0
-
-    run("param save", work, url, namespace)
+    found = await _declared(interface, None)
+    text = "".join(_yaml(it) for it in found if not it.invalid)
+    if file is None:
+        sys.stdout.write(text)
+    else:
+        with PartFile(file, replace=force) as part:
+            part.path.write_text(text, encoding="utf-8")
+    invalid = [it for it in found if it.invalid]
+    for it in invalid:
+        note(f"not saved: {it.invalid}")
+    if file is not None:
+        note(f"{file}: {counted(len(found) - len(invalid), 'parameter')}")
+    return FAILED if invalid else 0
 
 
-def load(
+@with_server("param load")
+async def load(
+    interface: RedisInterface,
     file: File,
     dry_run: Annotated[bool, typer.Option("--dry-run", "-n", help="Only report what would be changed.")] = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
 ) -> None:
     """Publish the values of parameters that a YAML file has.
 
@@ -168,42 +145,14 @@ def load(
         reem param load tuned.yaml --dry-run
         reem param load tuned.yaml
     """
-
-    async def work(interface: RedisInterface) -> None:
-        known, _ = await stored_parameters(interface.session)
-        changes = [(it, value) for it, value in _checked(_read(file), known, file) if it.value != value]
-        for it, value in changes:
-            if not dry_run:
-                await publish(interface.session, it.path, value)
-            before = "(out of range)" if it.invalid else "(none)" if it.value is None else _shown(it.value)
-            emit(f"{typed(it.path)}: {before} -> {_shown(value)}")
-        note(f"{'would change' if dry_run else 'changed'} {counted(len(changes), 'parameter')}")
-
-    run("param load", work, url, namespace)
-
-
-def forget(
-    names: Annotated[list[str], typer.Argument(metavar="PATH...", help="Parameters, by their paths.")],
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
-    """Remove what was declared of parameters. Their values stay; delete those with reem del.
-
-    For parameters of programs that do not exist any more. A program that runs works on, and declares its parameters
-    again when it is started. Exit code 3 if one was not declared.
-
-    Examples:
-        reem param forget control.old
-    """
-
-    async def work(interface: RedisInterface) -> None:
-        for name in names:
-            try:
-                await KeyValueStore(interface)[SPECIFICATIONS][name].delete()
-            except MissingKey:
-                raise CommandFailed(f"no program has declared {name}", NOTHING) from None
-
-    run("param forget", work, url, namespace)
+    known, _ = await stored_parameters(interface.session)
+    changes = [(it, value) for it, value in _checked(_read(file), known, file) if it.value != value]
+    for it, value in changes:
+        if not dry_run:
+            await publish(interface.session, it.path, value)
+        before = "(out of range)" if it.invalid else "(none)" if it.value is None else _shown(it.value)
+        emit(f"{typed(it.path)}: {before} -> {_shown(value)}")
+    note(f"{'would change' if dry_run else 'changed'} {counted(len(changes), 'parameter')}")
 
 
 async def _declared(interface: RedisInterface, patterns: Sequence[str] | None) -> list[StoredParameter]:
@@ -292,7 +241,7 @@ def _checked(
     return checked
 
 
-for _name, _command in (("list", list_), ("get", get), ("save", save), ("load", load), ("forget", forget)):
+for _name, _command in (("list", list_), ("get", get), ("save", save), ("load", load)):
     app.command(_name, help=help_text(_command.__doc__ or ""))(_command)
 _minus: Any = {"cls": MinusCommand, "context_settings": {"ignore_unknown_options": True}}  # for values such as -1.5
 app.command("set", help=help_text(set_.__doc__ or ""), **_minus)(set_)

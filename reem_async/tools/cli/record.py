@@ -10,30 +10,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reem_async.concurrency.tasks import come_second, keep_memory, stand_back
-from reem_async.connection import RedisInterface
-from reem_async.coordination.calls import statistics
-from reem_async.coordination.services import CALLS
-from reem_async.errors import BadValue, RedisError, ReemError
-from reem_async.store.store import KeyValueStore
-from reem_async.tools.cli.following import progress
-from reem_async.tools.cli.options import (
-    DEFAULT_URL,
-    AsJson,
-    Force,
-    Namespace,
-    Patterns,
-    Ships,
-    Url,
-    existing,
-    named_ships,
-)
-from reem_async.tools.cli.output import clean, emit, emit_json, figures, note, size_text
-from reem_async.tools.cli.running import CommandFailed, guarded, run
-from reem_async.transport.options import look_nearby
+from ...concurrency.tasks import come_second, keep_memory, stand_back
+from ...connection import RedisInterface
+from ...coordination.calls import statistics
+from ...coordination.services import CALLS
+from ...errors import BadValue, RedisError, ReemError
+from ...store.store import KeyValueStore
+from ...transport.options import look_nearby
+from .following import progress
+from .options import DEFAULT_URL, AsJson, Force, Namespace, Patterns, Ships, Url, existing, named_ships
+from .output import clean, emit, emit_json, figures, note, size_text
+from .running import CommandFailed, guarded, run
 
 if TYPE_CHECKING:
-    from reem_async.tools.recording import Recorder, RecorderStatus
+    from ..recording import Recorder, RecorderStatus
 
 # Seconds between two lines that say how it is getting on.
 _SHOWN_EVERY = 0.5
@@ -44,17 +34,13 @@ def record(
     patterns: Patterns = None,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file, MCAP.")] = Path("run.mcap"),
     sample: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", callback=existing, help="Read paths at given periods too: a line `path, seconds` for each."
-        ),
+        Path | None, typer.Option(metavar="FILE", callback=existing, help="Read paths too: lines `path, seconds`.")
     ] = None,
     duration: Annotated[
         float | None, typer.Option(min=0.001, metavar="SECONDS", help="End after so long; until Ctrl-C otherwise.")
     ] = None,
     keyframe: Annotated[
-        float,
-        typer.Option(min=0.05, metavar="SECONDS", help="Write the whole of the keys so often, to be found quickly."),
+        float, typer.Option(min=0.05, metavar="SECONDS", help="Write the whole of the keys so often.")
     ] = 5.0,
     compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
     force: Force = False,
@@ -94,7 +80,7 @@ def record(
         wanted.append(CALLS)
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.tools.recording import Recorder
+        from ..recording import Recorder
 
         # Before the recorder is made: threads that it starts inherit the scheduling.
         try:

@@ -12,15 +12,15 @@ import re
 import signal
 import sys
 import warnings
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from typing import Any
 
 import typer
 
-from reem_async.connection import RedisInterface
-from reem_async.errors import BadInput, MissingKey, RedisError, ReemError
-from reem_async.tools.cli.output import clean
+from ...connection import RedisInterface
+from ...errors import BadInput, MissingKey, RedisError, ReemError
+from .output import clean
 
 # Scripts depend on these numbers: the same in every command, listed in docs/reference/environment.md.
 FAILED, USAGE, NOTHING, TIMED_OUT, INTERRUPTED = 1, 2, 3, 4, 130
@@ -41,9 +41,12 @@ class CommandFailed(Exception):
         self.code = code
 
 
+Work = Callable[[RedisInterface], Coroutine[Any, Any, int | None]]
+
+
 def run(
     name: str,
-    work: Callable[[RedisInterface], Awaitable[int | None]],
+    work: Work,
     url: str,
     namespace: str,
     *,
@@ -67,9 +70,14 @@ def run_local(name: str, work: Callable[[], int | None], *, live: bool = False) 
 
 @contextmanager
 def guarded(name: str, *, live: bool = False) -> Iterator[None]:
-    """End the command where the block fails: errors that users can do something about become one line."""
+    """End the command where the block fails: errors that users can do something about become one line, and warnings."""
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        complain(name, "warning: " + (message if isinstance(message, str) else for_users(message)), 0)
+
     try:
-        with _short_warnings(name):
+        with warnings.catch_warnings():
+            warnings.showwarning = show  # Python would add the file and line of REEM's own code to each
             yield
         # Here and not when the interpreter ends, so that a closed pipe is seen while it can still be handled.
         sys.stdout.flush()
@@ -93,26 +101,20 @@ def guarded(name: str, *, live: bool = False) -> Iterator[None]:
     raise typer.Exit(code)
 
 
-async def _connected(
-    work: Callable[[RedisInterface], Awaitable[int | None]], url: str, namespace: str, ships: Sequence[Any] | None
-) -> Any:
+async def _connected(work: Work, url: str, namespace: str, ships: Sequence[Any] | None) -> Any:
     # Before connecting, so that Ctrl-C ends the waiting for a server that does not answer.
-    _cancel_on([signal.SIGINT, signal.SIGTERM, *_hangup()])
+    _cancel_on_signals()
     interface = interface_to(url, namespace, ships=ships)
     try:
-        await interface.initialize()
-        return await work(interface)
+        with closing(work(interface)) as doing:  # it may check what was typed before anything is sent
+            await interface.initialize()
+            return await doing
     finally:
         await interface.close()
 
 
-def _hangup() -> list[signal.Signals]:
-    """Return the signal of a terminal that closes, unless the command is to outlive it (nohup)."""
-    return [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
-
-
-def _cancel_on(signals: Sequence[signal.Signals]) -> None:
-    """Cancel this task when a signal comes. The same signal again ends the process, except for a hangup.
+def _cancel_on_signals() -> None:
+    """Cancel this task at Ctrl-C, SIGTERM, and when the terminal closes. Another Ctrl-C or SIGTERM ends the process.
 
     `asyncio.run` alone cancels within the signal handler, between any two steps of Python, also within asyncio's own
     code, which reports that at length.
@@ -120,15 +122,16 @@ def _cancel_on(signals: Sequence[signal.Signals]) -> None:
     task, loop = asyncio.current_task(), asyncio.get_running_loop()
 
     def cancel(number: signal.Signals) -> None:
-        if number in _hangup():  # the kernel sends one, and the shell another
+        if number == signal.SIGHUP:  # the kernel sends one, and the shell another
             loop.add_signal_handler(number, lambda: None)
         else:
             loop.remove_signal_handler(number)
         if task is not None:
             task.cancel()
 
-    for number in signals:
-        loop.add_signal_handler(number, cancel, number)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # else nohup has asked for it
+            loop.add_signal_handler(number, cancel, number)
 
 
 def interface_to(
@@ -146,26 +149,13 @@ def interface_to(
 
 
 def complain(name: str, message: str, code: int) -> int:
-    """Say in one line on standard error what is wrong; return `code`."""
+    """Say on standard error what is wrong, in one line unless a server's log is in it; return `code`."""
     prefix = f"reem {name}: "
     if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
         prefix = typer.style(prefix, fg="red", bold=True)
     with suppress(OSError):  # the terminal has closed
-        sys.stderr.write(prefix + clean(" ".join(message.split())) + "\n")
+        sys.stderr.write(prefix + "\n".join([clean(" ".join(line.split())) for line in message.splitlines()]) + "\n")
     return code
-
-
-@contextmanager
-def _short_warnings(name: str) -> Iterator[None]:
-    """Show warnings as one line each, without the place in the code that Python adds."""
-
-    def show(message: Warning | str, *_: object, **__: object) -> None:
-        complain(name, "warning: " + (message if isinstance(message, str) else for_users(message)), 0)
-
-    # Python would add the file and line of REEM's own code to each.
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield
 
 
 def for_users(error: Exception | Warning) -> str:

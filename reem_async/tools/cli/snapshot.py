@@ -6,46 +6,29 @@ import asyncio
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
-from reem_async.connection import RedisInterface
-from reem_async.errors import BadData, RedisError, ReemError
-from reem_async.tools import snapshots
-from reem_async.tools.cli.commands import help_text
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url, existing
-from reem_async.tools.cli.output import (
-    clean,
-    columns,
-    counted,
-    emit,
-    emit_json,
-    is_terminal,
-    note,
-    progress_bar,
-    size_text,
-    styled,
-)
-from reem_async.tools.cli.running import FAILED, for_users, run, run_local
-from reem_async.tools.snapshots import Progress, RdbUnavailable, Snapshot, described
-from reem_async.tools.snapshots.files import SUFFIXES, Pruned, is_dated, new_name, prune, sniff
+from ...connection import RedisInterface
+from ...errors import BadData, RedisError, ReemError
+from .. import snapshots
+from ..snapshots import Progress, RdbUnavailable, Snapshot, described
+from ..snapshots.files import SUFFIXES, is_automatic, is_dated, new_name, sniff
+from .commands import help_text
+from .options import AsJson, Force, Match, existing, with_server
+from .output import clean, columns, counted, emit, emit_json, note, progress_bar, size_text, styled
+from .running import FAILED, for_users, run_local
 
 app = typer.Typer(rich_markup_mode="rich", help="Save what a server holds to files, list them, restore them.")
 
+_ORIGIN = ("kind", "server", "namespace", "match")
 # Seconds of each unit.
 _UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
-
-Match = Annotated[
-    str,
-    typer.Option(
-        "--match", metavar="PATTERN", help="Only the top-level keys that match; * and ? stand for other characters."
-    ),
-]
 
 
 def period(text: str) -> float:
@@ -57,41 +40,28 @@ def period(text: str) -> float:
     return seconds
 
 
+@with_server("snapshot save")
 def save(
+    interface: RedisInterface,
     file: Annotated[
-        Path | None,
-        typer.Argument(metavar="FILE", show_default=False, help="The file to make. Without it, one named by time."),
+        Path | None, typer.Argument(metavar="FILE", show_default=False, help="The file; named by time without it.")
     ] = None,
     directory: Annotated[
-        Path | None,
-        typer.Option("--directory", "-d", metavar="DIR", show_default="here", help="Where to make one named by time."),
+        Path | None, typer.Option("--directory", "-d", metavar="DIR", show_default="here", help="Where to make it.")
     ] = None,
     match: Match = "*",
     rdb: Annotated[
-        bool,
-        typer.Option(
-            "--rdb",
-            help="Have the server save all it holds, foreign keys too, and copy its RDB file; a portable snapshot "
-            "where that cannot be had.",
-        ),
+        bool, typer.Option("--rdb", help="An RDB file of all that the server holds; a portable file if there is none.")
     ] = False,
     every: Annotated[
-        float | None,
-        typer.Option(
-            "--every", metavar="PERIOD", parser=period, help="Go on until Ctrl-C: one each 30s, 10m, 1.5h or 1d."
-        ),
+        float | None, typer.Option("--every", metavar="PERIOD", parser=period, help="Go on: 30s, 10m, 1.5h or 1d.")
     ] = None,
     keep: Annotated[
-        int | None,
-        typer.Option(
-            "--keep", min=1, metavar="N", help="Leave the newest N, delete older ones that were saved with --keep."
-        ),
+        int | None, typer.Option("--keep", min=1, metavar="N", help="Delete all but the newest N saved with --keep.")
     ] = None,
     force: Force = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
     as_json: AsJson = False,
-) -> None:
+) -> Coroutine[Any, Any, int]:
     """Save the keys of REEM to a file, or all of the server with --rdb.
 
     A portable snapshot is a zip file of documents and arrays. Each key in it is of one instant. It only needs the
@@ -111,16 +81,13 @@ def save(
         raise typer.BadParameter("--rdb saves all of the server: leave out --match")
     # A file that is named by time has a name that is free.
     overwrite = force and file is not None
-    saver = _Saver(file, directory or Path(), match, rdb, keep, overwrite, as_json)
-
-    async def work(interface: RedisInterface) -> int:
-        return await (saver.once(interface) if every is None else saver.by_period(interface, every))
-
-    run("snapshot save", work, url, namespace, live=every is not None)
+    saver = _Saver(interface, file, directory or Path(), match, rdb, keep, overwrite, as_json)
+    return saver.once() if every is None else saver.by_period(every)
 
 
 @dataclass
 class _Saver:
+    interface: RedisInterface
     file: Path | None
     directory: Path
     match: str
@@ -128,19 +95,23 @@ class _Saver:
     keep: int | None
     overwrite: bool
     as_json: bool
-    made: list[Path] = field(default_factory=list)
-    noted: set[str] = field(default_factory=set)
 
-    async def once(self, interface: RedisInterface, *, bar: bool = True) -> int:
+    async def once(self) -> int:
         """Take one, delete what is too old, print a line; return the exit code."""
         started = time.monotonic()
-        it = await self._saved(interface, bar)
+        it = await self._saved()
+        gone: list[Path] = []
+        failure: OSError | None = None
         # Only when the new one is complete and on the disk are old ones deleted: they may have what it lacks.
-        gone, failed = ([], []) if it.unsaved else await asyncio.to_thread(self._pruned, it.path)
+        if self.keep is not None and not it.unsaved:
+            try:
+                gone = await asyncio.to_thread(prune, it, self.keep)
+            except OSError as error:
+                failure = error
         self._tell(it, gone, time.monotonic() - started)
-        for error in failed:
-            note(f"reem snapshot save: saved, but an older one could not be deleted: {for_users(error)}")
-        return FAILED if failed or it.unsaved else 0
+        if failure:
+            note(f"reem snapshot save: saved, but an older one could not be deleted: {for_users(failure)}")
+        return FAILED if failure or it.unsaved else 0
 
     def _tell(self, it: Snapshot, gone: Sequence[Path], seconds: float) -> None:
         if self.as_json:
@@ -151,23 +122,23 @@ class _Saver:
         emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, {seconds:.2f} s{clean(deleted)}")
         sys.stdout.flush()
         for place, why in it.unsaved.items():
-            self._note_once(f"Not saved: {place}: {why}")
+            note(f"Not saved: {place}: {why}")
         if it.doubt:
-            self._note_once(f"The snapshot may not be complete: {it.doubt}.")
+            note(f"The snapshot may not be complete: {it.doubt}.")
 
-    async def by_period(self, interface: RedisInterface, every: float) -> NoReturn:
+    async def by_period(self, every: float) -> int:
         """Take one each `every` seconds; what goes wrong after the first is said, and the next is tried."""
         start, turn = time.monotonic(), 0
         try:
             while True:
                 try:
-                    await self.once(interface, bar=False)
+                    await self.once()
                 except BrokenPipeError:  # the reader of the output has ended
                     raise
                 except (ReemError, RedisError, OSError) as error:
                     # If the first one fails, the user is still there to mend it; later ones are tried again by
                     # themselves.
-                    if not self.made:
+                    if not turn:
                         raise
                     note(f"reem snapshot save: not saved, next try in due time: {for_users(error)}")
                 # By the clock of the first one, so that the times do not drift; turns that a long save has missed are
@@ -176,56 +147,46 @@ class _Saver:
                 await asyncio.sleep(start + turn * every - time.monotonic())
         except asyncio.CancelledError:
             note("Stopped; what is listed above is complete.")
-            raise
+            return 0
 
-    async def _saved(self, interface: RedisInterface, bar: bool) -> Snapshot:
-        while True:
-            try:
-                return await self._saved_as(interface, bar)
-            except FileExistsError:
-                # Of one named by time: another program has begun one in the same second, and this gets the next number.
-                if self.file is not None:
-                    raise
-
-    async def _saved_as(self, interface: RedisInterface, bar: bool) -> Snapshot:
+    async def _saved(self) -> Snapshot:
         if self.rdb:
             try:
-                return await snapshots.save_rdb(interface, self._path("rdb"), overwrite=self.overwrite)
-            # Said once; the next ones by period try again, since rights may have changed.
+                return await snapshots.save_rdb(self.interface, self._path("rdb"), overwrite=self.overwrite)
             except RdbUnavailable as error:
-                self._note_once(
-                    f"No RDB file: {for_users(error)}. A portable snapshot, of the keys of REEM, is taken instead."
-                )
-        with _progress(shown=bar and not self.as_json) as progress:
+                note(f"No RDB file: {for_users(error)}. A portable snapshot, of the keys of REEM, is taken instead.")
+        with _progress(shown=not self.as_json) as progress:
             return await snapshots.save(
-                interface, self._path("portable"), self.match, overwrite=self.overwrite, progress=progress
+                self.interface, self._path("portable"), self.match, overwrite=self.overwrite, progress=progress
             )
 
     def _path(self, kind: str) -> Path:
         return self.file or new_name(self.directory, kind, time.time(), auto=self.keep is not None)
 
-    def _pruned(self, newest: Path) -> Pruned:
-        self.made.append(newest)
-        # Without --keep nothing is ever deleted, so there is nothing to remember.
-        if self.keep is None:
-            del self.made[:-1]
-            return Pruned([], [])
-        done = prune(self.made, self.keep)
-        del self.made[: -self.keep]
-        return done
 
-    def _note_once(self, text: str) -> None:
-        if text not in self.noted:
-            self.noted.add(text)
-            note(text)
+def prune(newest: Snapshot, keep: int) -> list[Path]:
+    """Delete the oldest snapshots saved with --keep until so many are left, the newest among them; return them.
+
+    Only files beside the newest, of its kind, server, namespace and pattern. The times of the files tell their age.
+    """
+    others = [path for path in newest.path.parent.iterdir() if path != newest.path and _is_alike(path, newest)]
+    others.sort(key=lambda path: path.stat().st_mtime_ns)
+    gone = others[: max(0, len(others) + 1 - keep)]
+    for path in gone:
+        path.unlink(missing_ok=True)
+    return gone
+
+
+def _is_alike(path: Path, newest: Snapshot) -> bool:
+    with suppress(BadData, OSError):  # a file of another program
+        it = described(path) if is_automatic(path) else None
+        return it is not None and all(getattr(it, name) == getattr(newest, name) for name in _ORIGIN)
+    return False
 
 
 def list_(
     path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PATH", callback=existing, show_default="here", help="A directory, or one snapshot to look into."
-        ),
+        Path, typer.Argument(metavar="PATH", callback=existing, show_default="here", help="A directory, or a snapshot.")
     ] = Path(),
     as_json: AsJson = False,
 ) -> None:
@@ -240,12 +201,12 @@ def list_(
     run_local("snapshot list", lambda: listed(path, as_json))
 
 
-def restore(
+@with_server("snapshot restore")
+async def restore(
+    interface: RedisInterface,
     file: Annotated[Path, typer.Argument(metavar="FILE", callback=existing, help="A portable snapshot.")],
     match: Match = "*",
     replace: Annotated[bool, typer.Option("--replace", help="Keys that are there may be replaced.")] = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
     as_json: AsJson = False,
 ) -> None:
     """Write the keys of a snapshot to a server, and tell their subscribers.
@@ -259,19 +220,15 @@ def restore(
       reem snapshot restore --replace --match 'arm*' before.zip
       reem snapshot restore --namespace old: before.zip
     """
-
-    async def work(interface: RedisInterface) -> None:
-        with _progress(shown=not as_json) as progress:
-            done = await snapshots.restore(interface, file, match, replace=replace, progress=progress)
-        if as_json:
-            emit_json({"path": str(file), "restored": list(done.names), "size": done.size})
-            return
-        emit(f"{counted(len(done.names), 'key')} restored, {size_text(done.size)}")
-        saved = (await snapshots.describe(file)).namespace
-        if saved != namespace:
-            note(f"They were saved under the namespace {saved!r} and are now under {namespace!r} (--namespace).")
-
-    run("snapshot restore", work, url, namespace)
+    with _progress(shown=not as_json) as progress:
+        done = await snapshots.restore(interface, file, match, replace=replace, progress=progress)
+    if as_json:
+        emit_json({"path": str(file), "restored": list(done.names), "size": done.size})
+        return
+    emit(f"{counted(len(done.names), 'key')} restored, {size_text(done.size)}")
+    saved, now = (await snapshots.describe(file)).namespace, interface.namespace
+    if saved != now:
+        note(f"They were saved under the namespace {saved!r} and are now under {now!r} (--namespace).")
 
 
 @contextmanager
@@ -324,9 +281,8 @@ def _show_files(found: list[Snapshot], damaged: dict[str, str], directory: Path,
         [clean(it.path.name), it.kind, _when(it), size_text(it.size), "" if it.count is None else str(it.count)]
         for it in found
     ]
-    if rows and is_terminal():
-        rows.insert(0, ["name", "kind", "taken", "size", "keys"])
-    columns(rows, ["cyan", "", "", "", ""], frozenset({3, 4}))
+    heads = ("name", "kind", "taken", "size", "keys") if rows else ()
+    columns(rows, ["cyan", "", "", "", ""], frozenset({3, 4}), heads=heads)
     if not rows and not damaged:
         note(clean(f"No snapshots in {directory.resolve()}; `reem snapshot save` makes one."))
     for error in damaged.values():

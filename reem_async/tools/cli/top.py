@@ -21,15 +21,15 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from reem_async.connection import RedisInterface
-from reem_async.coordination.calls import statistics
-from reem_async.errors import RedisError, ReemError
-from reem_async.pubsub.monitor import Event
-from reem_async.tools.cli.following import Ending, follow
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
-from reem_async.tools.cli.output import emit, emit_json, is_terminal, note, size_text, typed
-from reem_async.tools.cli.running import run
-from reem_async.tools.cli.services import HEADS, service_cells
+from ...connection import RedisInterface
+from ...coordination.calls import statistics
+from ...errors import RedisError, ReemError
+from ...pubsub.monitor import Event
+from .following import Ending, follow
+from .options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
+from .output import emit, emit_json, is_terminal, note, size_text, typed
+from .programs import HEADS, service_cells
+from .running import run
 
 _WINDOW = 1000  # updates of a path that count: five seconds of an IMU at 200 Hz, half a minute of a camera
 _DRAW_SECONDS = 0.25  # people can read numbers that change four times a second

@@ -5,21 +5,20 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
-from reem_async.errors import LoginRefused, RedisError, ReemError, ServerFailed, ServerMissing
-from reem_async.server import EmbeddedServer
-from reem_async.server.cluster import EmbeddedCluster
-from reem_async.tools.cli.options import existing
-from reem_async.tools.cli.output import clean, emit, facts_lines, styled
-from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, for_users, interface_to
+from ...errors import LoginRefused, RedisError, ReemError
+from ...server import EmbeddedServer
+from ...server.cluster import EmbeddedCluster
+from ...server.process import PortTaken
+from .options import existing
+from .output import emit, facts_lines, styled
+from .running import PASSWORD_VARIABLE, CommandFailed, guarded, interface_to
 
 LOOK_SECONDS = 0.1  # between looks whether the server is still there, and whether to end
 
@@ -43,29 +42,18 @@ class Stop:
         return self.is_set
 
 
-def fail(message: str) -> NoReturn:
-    sys.stderr.write("reem up: " + "\n".join(map(clean, message.split("\n"))) + "\n")
-    raise typer.Exit(1)
-
-
 def _up_cluster(*, plain: bool) -> None:
-    """Keep a cluster up until told to stop."""
-    stop = Stop()
-    try:
-        with EmbeddedCluster(json=not plain) as cluster:
-            emit(styled("REEM's cluster is up.", "green"))
-            half = len(cluster.nodes) // 2
-            nodes = [f"port {node.port}, process {node.pid}" for node in cluster.nodes]
-            labels = ["primaries", *[""] * (half - 1), "replicas", *[""] * (half - 1)]
-            facts_lines([("address", cluster.url), *zip(labels, nodes, strict=True)])
-            facts_lines(_use(cluster.url, json=cluster.json, data="in memory, gone when the cluster stops"))
-            while not stop.wait():
-                pass
-    except (ServerFailed, ServerMissing) as error:
-        fail(for_users(error))
-    with suppress(OSError):  # the terminal may have closed
-        emit("Stopped. The data is gone.")
-        sys.stdout.flush()
+    with EmbeddedCluster(json=not plain) as cluster:
+        stop = Stop()
+        emit(styled("REEM's cluster is up.", "green"))
+        half = len(cluster.nodes) // 2
+        nodes = [f"port {node.port}, process {node.pid}" for node in cluster.nodes]
+        labels = ["primaries", *[""] * (half - 1), "replicas", *[""] * (half - 1)]
+        facts_lines([("address", cluster.url), *zip(labels, nodes, strict=True)])
+        facts_lines(_use(cluster.url, json=cluster.json, data="in memory, gone when the cluster stops"))
+        while not stop.wait():
+            pass
+    emit("Stopped. The data is gone.")
 
 
 def _use(url: str, password: str | None = None, *, json: bool, data: str) -> list[tuple[str, str]]:
@@ -84,17 +72,10 @@ def _use(url: str, password: str | None = None, *, json: bool, data: str) -> lis
 
 def up(
     port: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            max=65535,
-            show_default="6379; a free one with --from",
-            help="TCP port on 127.0.0.1; 0 takes a free one.",
-        ),
+        int | None, typer.Option(min=0, max=65535, show_default="6379, 0 with --from", help="TCP port; 0: a free one.")
     ] = None,
     directory: Annotated[
-        Path | None,
-        typer.Option(file_okay=False, help="Keep the data here; without it, it is gone with the server."),
+        Path | None, typer.Option(file_okay=False, help="Keep the data here; else it is gone with the server.")
     ] = None,
     snapshot: Annotated[
         Path | None,
@@ -107,20 +88,13 @@ def up(
         ),
     ] = None,
     maxmemory: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SIZE", help="The most that the data may take, such as 2gb; writes beyond it are refused."
-        ),
+        str | None, typer.Option(metavar="SIZE", help="Refuse writes beyond so much data, such as 2gb.")
     ] = None,
     cluster: Annotated[
-        bool,
-        typer.Option(
-            "--cluster", help="A cluster of three primaries and three replicas, in memory, on free ports; to try it."
-        ),
+        bool, typer.Option("--cluster", help="Three primaries and three replicas, in memory, on free ports; to try it.")
     ] = False,
     plain: Annotated[
-        bool,
-        typer.Option("--plain", help="Without the JSON module: documents are stored as text, as on arm64 and macOS."),
+        bool, typer.Option("--plain", help="Store documents as text, without the JSON module, as on arm64 and macOS.")
     ] = False,
 ) -> None:
     """Start a private server and keep it up until Ctrl-C.
@@ -136,36 +110,39 @@ def up(
       reem up --cluster
       reem up --plain
     """
-    if cluster:
-        if any(given is not None for given in (port, directory, snapshot, maxmemory)):
-            fail("--cluster takes no other option than --plain: it is in memory, on free ports, without a password")
-        _up_cluster(plain=plain)
-        return
+    with guarded("up"):
+        if not cluster:
+            _up_server(port, directory, snapshot, maxmemory, plain=plain)
+        elif any(given is not None for given in (port, directory, snapshot, maxmemory)):
+            raise CommandFailed(
+                "--cluster takes no other option than --plain: it is in memory, on free ports, without a password"
+            )
+        else:
+            _up_cluster(plain=plain)
+
+
+def _up_server(
+    port: int | None, directory: Path | None, snapshot: Path | None, maxmemory: str | None, *, plain: bool
+) -> None:
     password = os.environ.get(PASSWORD_VARIABLE)
     if password == "":
-        fail(f"the environment variable {PASSWORD_VARIABLE} is empty; unset it, or give it a password")
+        raise CommandFailed(f"the environment variable {PASSWORD_VARIABLE} is empty; unset it, or give it a password")
     if port is None:
         port = 0 if snapshot else DEFAULT_PORT
-    if snapshot is not None and snapshot.exists() and not snapshot.is_file():
-        fail(f"{snapshot} is no file; give a snapshot")
+    if snapshot is not None and not snapshot.is_file():
+        raise CommandFailed(f"{snapshot} is no file; give a snapshot")
     try:
-        server = EmbeddedServer(port, directory, password, snapshot, json=not plain, maxmemory=maxmemory)
-        with server:  # until it is up, Ctrl-C ends the loading at once
-            stop = Stop()
+        with EmbeddedServer(port, directory, password, snapshot, json=not plain, maxmemory=maxmemory) as server:
+            stop = Stop()  # until now, Ctrl-C ended the loading at once
             _describe(server, directory, password, snapshot)
             while not stop.wait():
-                # A server that ends by itself has said why in its log, which goes with its directory.
                 if not server.running:
-                    fail(f"the server ended by itself; its log ends:\n{_log_end(server)}")
-    except (ReemError, RedisError, OSError) as error:
-        # Most often the port is taken by the server that the user wants: it is looked at before it is complained of.
-        there = _who_is_there(port) if "is taken" in str(error) else ""
-        fail(for_users(error) + there)
-    except KeyboardInterrupt:
-        raise typer.Exit(INTERRUPTED) from None
-    with suppress(OSError):  # the terminal may have closed
-        emit(f"Stopped. The data is {'kept' if directory else 'gone'}.")
-        sys.stdout.flush()
+                    # It has said why in its log, which goes with its directory.
+                    log = (server.directory / "server.log").read_text(errors="replace").splitlines()[-5:]
+                    raise CommandFailed("\n".join(["the server ended by itself; its log ends:", *log]))
+    except PortTaken as error:  # most often by the server that the user wants
+        raise CommandFailed(f"{error}{_who_is_there(port)}") from None
+    emit(f"Stopped. The data is {'kept' if directory else 'gone'}.")
 
 
 def _who_is_there(port: int) -> str:
@@ -205,8 +182,3 @@ def _describe(server: EmbeddedServer, directory: Path | None, password: str | No
     )
     data = f"{server.directory}, kept" if directory else "in memory, gone when the server stops"
     facts_lines(_use(url, password, json=server.json, data=data))
-
-
-def _log_end(server: EmbeddedServer) -> str:
-    """The last lines of the log, read now since a temporary directory goes with the server."""
-    return "\n".join((server.directory / "server.log").read_text(errors="replace").splitlines()[-5:])

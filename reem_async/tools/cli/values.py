@@ -7,7 +7,7 @@ import json
 import sys
 import time
 import zipfile
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Annotated, Any, NoReturn
@@ -15,30 +15,20 @@ from typing import IO, Annotated, Any, NoReturn
 import numpy as np
 import typer
 
-from reem_async.connection import RedisInterface
-from reem_async.errors import MissingKey
-from reem_async.plan.paths import Path as KeyPath
-from reem_async.plan.paths import show
-from reem_async.plan.trees import walk
-from reem_async.store.accessor import Accessor
-from reem_async.store.catalog import Outline, outline
-from reem_async.store.document import DocumentReader
-from reem_async.store.store import KeyValueStore, PublishSpace
-from reem_async.tools.cli.listing import as_data
-from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
-from reem_async.tools.cli.output import (
-    clean,
-    counted,
-    emit,
-    is_terminal,
-    json_text,
-    note,
-    size_text,
-    typed,
-    width,
-)
-from reem_async.tools.cli.running import NOTHING, USAGE, CommandFailed, guarded, run
-from reem_async.tools.partfile import PartFile, there_already
+from ...connection import RedisInterface
+from ...errors import MissingKey
+from ...plan.paths import Path as KeyPath
+from ...plan.paths import show
+from ...plan.trees import walk
+from ...store.accessor import Accessor
+from ...store.catalog import Outline, outline
+from ...store.document import DocumentReader
+from ...store.store import KeyValueStore, PublishSpace
+from ..partfile import PartFile, there_already
+from .listing import as_data
+from .options import DEFAULT_URL, Force, Namespace, Output, PathArgument, Publish, Text, Url, Value, with_server
+from .output import clean, counted, emit, is_terminal, json_text, note, size_text, typed, width
+from .running import NOTHING, USAGE, CommandFailed, guarded, run
 
 _MOST_FOR_PREVIEW = 256_000_000
 """Bytes of an array that is fetched only to show its corners."""
@@ -49,23 +39,11 @@ _RATE = 1.0
 
 def get(
     path: PathArgument,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help="Write it to a file: .npy an array, .npz all arrays below, .json all, .png an image, .bin bytes.",
-        ),
-    ] = None,
+    output: Output = None,
     force: Force = False,
     raw: Annotated[bool, typer.Option("--raw", "-r", help="Print text as it is, without quotes.")] = False,
     as_json: Annotated[
-        bool,
-        typer.Option(
-            "--json",
-            help="Print JSON in one line: arrays as lists, bytes in base64, NaN by name, times in ISO 8601.",
-        ),
+        bool, typer.Option("--json", help="One line: arrays as lists, bytes in base64, NaN by name, times in ISO 8601.")
     ] = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
@@ -86,12 +64,10 @@ def get(
     """
     if raw and (as_json or output):
         raise typer.BadParameter("--raw goes neither with --json nor with -o")
-    if output is not None and output.suffix not in FILES:
-        raise typer.BadParameter(f"{output}: the name of a file ends in one of {', '.join(FILES)}")
+    with guarded("get"):
+        check_output(output, force=force)
 
     async def work(interface: RedisInterface) -> None:
-        if output is not None and output.exists() and not force:
-            raise there_already(output)
         store = KeyValueStore(interface)
         # First what it is, without arrays: then what is too large to be shown is not fetched.
         try:
@@ -143,14 +119,10 @@ async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: boo
     return preview(await fetch(), width() if is_terminal() else 100)
 
 
+@with_server("set")
 def set_(
-    path: PathArgument,
-    value: Value,
-    is_text: Text = False,
-    publish: Publish = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
+    interface: RedisInterface, path: PathArgument, value: Value, is_text: Text = False, publish: Publish = False
+) -> Coroutine[Any, Any, None]:
     """Store a value.
 
     The dict that holds it must be there: for foo.bar there must be a foo. Subscribers are only
@@ -164,21 +136,11 @@ def set_(
         reem set map @map.npy
         jq .config robot.json | reem set config -
     """
-    with guarded("set"):
-        parsed = parse_value(value, is_text=is_text)
-
-    async def work(interface: RedisInterface) -> None:
-        await _place(interface, path, publish).write(parsed)
-
-    run("set", work, url, namespace)
+    return _place(interface, path, publish).write(parse_value(value, is_text=is_text))
 
 
-def delete(
-    path: PathArgument,
-    publish: Publish = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
+@with_server("del")
+async def delete(interface: RedisInterface, path: PathArgument, publish: Publish = False) -> None:
     """Delete a value, with all that is below it.
 
     Exit code 3 if nothing is there.
@@ -188,32 +150,26 @@ def delete(
         reem del robot.joints[-1] --publish
         reem del robot
     """
-
-    async def work(interface: RedisInterface) -> None:
-        await _place(interface, path, publish).delete()
-
-    run("del", work, url, namespace)
+    await _place(interface, path, publish).delete()
 
 
 def _place(interface: RedisInterface, path: str, publish: bool) -> Accessor:
     return (PublishSpace if publish else KeyValueStore)(interface).at(path)
 
 
+@with_server("pub")
 def pub(
+    interface: RedisInterface,
     path: PathArgument,
     value: Value,
     rate: Annotated[
-        float | None,
-        typer.Option("--rate", "-r", min=0.001, max=100_000, metavar="HZ", help="So often, until Ctrl-C or --count."),
+        float | None, typer.Option("--rate", "-r", min=0.001, max=100_000, metavar="HZ", help="So often, until Ctrl-C.")
     ] = None,
     count: Annotated[
-        int | None,
-        typer.Option("--count", "-n", min=1, metavar="N", help="So many times; at 1 Hz if there is no --rate."),
+        int | None, typer.Option("--count", "-n", min=1, metavar="N", help="So many times; at 1 Hz if no --rate.")
     ] = None,
     is_text: Text = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
+) -> Coroutine[Any, Any, None]:
     """Publish a value, once or at a rate.
 
     Stores it as `reem set` does, and notifies subscribers. At a rate, late updates are not made up for. The last
@@ -225,19 +181,11 @@ def pub(
         reem pub beep true --rate 2 --count 10
         reem pub map @map.npy
     """
-    with guarded("pub"):
-        parsed = parse_value(value, is_text=is_text)
-    repeated = rate is not None or count is not None
-
-    async def work(interface: RedisInterface) -> None:
-        place = PublishSpace(interface).at(path)
-        if repeated:
-            until = "" if count else " until Ctrl-C"
-            await _repeat(place, parsed, rate or _RATE, count, f"publishing {path} at {rate or _RATE:g} Hz{until}")
-        else:
-            await place.write(parsed)
-
-    run("pub", work, url, namespace, live=repeated)
+    place, parsed = PublishSpace(interface).at(path), parse_value(value, is_text=is_text)
+    if rate is None and count is None:
+        return place.write(parsed)
+    until = "" if count else " until Ctrl-C"
+    return _repeat(place, parsed, rate or _RATE, count, f"publishing {path} at {rate or _RATE:g} Hz{until}")
 
 
 async def _repeat(place: Accessor, value: Any, rate: float, count: int | None, said: str) -> None:
@@ -342,17 +290,20 @@ def _range(array: Any) -> str:
     return f", min {numbers.min()}, max {numbers.max()}, mean {numbers.mean(dtype=np.float64):.6g}" + text
 
 
+def check_output(output: Path | None, *, force: bool) -> None:
+    """Raise an error if a value cannot be written to a file of this name."""
+    if output is not None and output.suffix not in FILES:
+        raise CommandFailed(f"{output}: the name of a file ends in one of {', '.join(FILES)}", USAGE)
+    if output is not None and output.exists() and not force:
+        raise there_already(output)
+
+
 def save(value: Any, path: Path, where: str, *, replace: bool = False) -> str:
     """Write what was read at `where` to a file, whole or not at all; return what to say of it."""
     write = FILES[path.suffix]
     try:
-        part = PartFile(path, replace=replace)
-        try:
-            with part.path.open("wb") as file:
-                said = write(value, file, where)
-            part.finish()
-        finally:
-            part.close()
+        with PartFile(path, replace=replace) as part, part.path.open("wb") as file:
+            said = write(value, file, where)
     except FileExistsError:
         raise
     except OSError as error:

@@ -246,12 +246,6 @@ def _classes() -> dict[str, Any]:
 
 
 _CLASSES = _classes()
-_DATA_FIELD = {
-    "foxglove.RawImage": "data",
-    "foxglove.CompressedImage": "data",
-    "reem.NdArray": "npy",
-    "reem.Blob": "data",
-}
 
 
 def schema_bytes(schema: str) -> bytes:
@@ -288,7 +282,7 @@ def encode(label: str, value: Any, frame: str, time: int) -> EncodedMessage:
 def _encoded(schema: str, channels: str, head: Any, time: int, pieces: list[Any]) -> EncodedMessage:
     """Return the message `head` with its data field put behind it, which saves copies of the data."""
     head.timestamp.seconds, head.timestamp.nanos = divmod(time, 1_000_000_000)
-    number = head.DESCRIPTOR.fields_by_name[_DATA_FIELD[schema]].number
+    number = head.DESCRIPTOR.fields_by_name["npy" if schema == "reem.NdArray" else "data"].number
     # The wire format of a bytes field: number and type (2) in one varint, the length in another, the bytes. Fields of a
     # message may come in any order, so the data can be last.
     tag = bytes([number << 3 | 2]) + _varint(sum([len(piece) for piece in pieces]))

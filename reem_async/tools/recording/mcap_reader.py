@@ -64,16 +64,11 @@ class Source:
 
     def read(self, start: int, size: int) -> bytes:
         """Return `size` bytes from `start`; OSError if the file has become shorter than it was."""
-        pieces: list[bytes] = []
         with self._lock:
-            self._file.seek(start)
-            while size > 0:
-                piece = self._file.read(size)
-                if not piece:
-                    raise OSError(errno.EIO, "cut short while it was being read; open it again", str(self.path))
-                pieces.append(piece)
-                size -= len(piece)
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+            found = os.pread(self._file.fileno(), size, start)
+        if len(found) < size:
+            raise OSError(errno.EIO, "cut short while it was being read; open it again", str(self.path))
+        return found
 
     def peek(self, start: int, size: int) -> bytes:
         """Return what `read` does, or less at the end of the file; quick where the next call is for what follows."""

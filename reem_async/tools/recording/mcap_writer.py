@@ -17,26 +17,12 @@ from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 
-from .contents import slices
 from .mcap_reader import HEAD, MAGIC, MESSAGE
-from .output import Output
+from .output import Output, slices
 
 # Bytes after which a chunk is closed: large enough to compress well, small enough to be unpacked for one message.
 _CHUNK_BYTES = 1 << 20
@@ -107,25 +93,25 @@ class McapWriter:
         self._output = output
         self._name, self._compressor = COMPRESSIONS[compression]
         # Schemas and channels are written where they are first used, and again in the summary.
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
+        self._schemas: list[records.Schema] = []
+        self._channels: list[records.Channel] = []
         # It grows with chunks times channels, 40 KB a second for a thousand keys: never in memory as a whole.
         self._index: IO[bytes] = tempfile.SpooledTemporaryFile(_INDEX_BYTES, dir=str(output.directory))  # noqa: SIM115 - closed by close()
         self._chunks = 0
         self._first, self._last = _NEVER, 0
-        self._metadata: list[MetadataIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._chunk = _Chunk()
-        output.write(MAGIC + _record(Header("", library)))
+        output.write(MAGIC + _record(records.Header("", library)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
+        schema = records.Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
         self._schemas.append(schema)
         self._chunk.put(_record(schema))
         return schema.id
 
     def register_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        channel = Channel(
+        channel = records.Channel(
             id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema, metadata=metadata
         )
         self._channels.append(channel)
@@ -150,8 +136,8 @@ class McapWriter:
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
         """Write a metadata record, behind the chunks closed so far."""
-        record = _record(Metadata(name=name, metadata=dict(metadata)))
-        self._metadata.append(MetadataIndex(offset=self._output.tell(), length=len(record), name=name))
+        record = _record(records.Metadata(name=name, metadata=dict(metadata)))
+        self._metadata.append(records.MetadataIndex(offset=self._output.tell(), length=len(record), name=name))
         self._output.write(record)
 
     def flush(self) -> None:
@@ -162,9 +148,9 @@ class McapWriter:
     def finish(self) -> None:
         self._close_chunk()
         # 0: no checksum of the data section, which would be of hours of data; each chunk has its own.
-        self._output.write(_record(DataEnd(0)))
+        self._output.write(_record(records.DataEnd(0)))
         start = self._output.tell()
-        offsets: list[SummaryOffset] = []
+        offsets: list[records.SummaryOffset] = []
         checked = 0
         for opcode, pieces in self._summary():
             begin = self._output.tell()
@@ -174,11 +160,11 @@ class McapWriter:
                 # A full piece of the index of chunks: of hours of recording it is not kept in memory as a whole.
                 if len(piece) == _PIECE:
                     self._output.flush()
-            offsets.append(SummaryOffset(opcode, begin, self._output.tell() - begin))
+            offsets.append(records.SummaryOffset(opcode, begin, self._output.tell() - begin))
         offsets_start = self._output.tell()
         text = b"".join([_record(offset) for offset in offsets])
         self._output.write(text)
-        footer = _record(Footer(start, offsets_start, 0))
+        footer = _record(records.Footer(start, offsets_start, 0))
         # The checksum covers the summary, and the footer up to the checksum itself.
         checked = zlib.crc32(footer[:-4], zlib.crc32(text, checked))
         self._output.write(footer[:-4] + struct.pack("<I", checked) + MAGIC)
@@ -200,8 +186,8 @@ class McapWriter:
     def __del__(self) -> None:
         self.close()
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
+    def _statistics(self) -> records.Statistics:
+        return records.Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
@@ -230,10 +216,10 @@ class McapWriter:
         for channel, entries in chunk.index.items():
             # Where each channel's index is: readers of one channel skip the others.
             places[channel] = index_start + index.count
-            MessageIndex(channel, entries).write(index)
+            records.MessageIndex(channel, entries).write(index)
         text = _ended(index)
         self._output.write(text)
-        entry = ChunkIndex(
+        entry = records.ChunkIndex(
             chunk_length=length + 9,
             chunk_start_offset=start,
             compression=self._name,
@@ -259,7 +245,7 @@ class McapWriter:
         return checked, [*data, end()]
 
 
-def _record(record: McapRecord) -> bytes:
+def _record(record: records.McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return _ended(builder)

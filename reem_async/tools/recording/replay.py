@@ -6,6 +6,8 @@ import asyncio
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from ...connection import RedisInterface
@@ -93,7 +95,7 @@ class Replayer:
         self._patterns: list[Pattern] = [parse_pattern(text) for text in patterns]
         self._remap = {_name(old): _name(new) for old, new in (remap or {}).items()}
         self._check_names(log.names())
-        self._space = PublishSpace(interface)
+        self._space: Any = PublishSpace(interface)
         self._session = interface.session
         self._updates: Iterator[LogUpdate] | None = None
         self._position = self.start
@@ -228,10 +230,7 @@ class Replayer:
         self._published += 1
 
     def _at(self, path: Path) -> Any:
-        handle: Any = self._space
-        for key in path:
-            handle = handle[key]
-        return handle
+        return reduce(getitem, path, self._space)
 
     def _renamed(self, path: Path) -> Path:
         name = str(path[0])

@@ -13,7 +13,7 @@ from ...errors import BadInput, BadValue, RedisError
 from ...plan.arguments import check_instance, check_number
 from ...plan.paths import Path, check_top_key, counts_from_end, parse, show
 from ...session import Session
-from .key_reader import fetch
+from .key_recorder import fetch
 
 
 class Sample(NamedTuple):
@@ -100,7 +100,7 @@ class Sampler:
         while True:
             await asyncio.sleep(begin + count * each.seconds - loop.time())
             try:
-                value, size, _ = await fetch(self._session, keys, each.path[1:])
+                value, size = await fetch(self._session, keys, each.path[1:])
             except (RedisError, OSError, ValueError):
                 self.failed += 1
             else:

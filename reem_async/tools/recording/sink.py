@@ -36,6 +36,8 @@ _MOST_CHANNELS = 60_000
 _MOST_SCHEMAS = 8
 """Schemas a path may have before it gets one that fits everything."""
 
+_DRAFT = "https://json-schema.org/draft/2020-12/schema"
+
 KEYFRAMES = "/_reem/keyframe"
 OPERATIONS = "/_reem/ops"
 CHANNELS = "reem.channels"
@@ -66,9 +68,9 @@ class Sink:
             self.output.flush()
         except OSError as error:
             raise RecordingFailed(f"{path} cannot be written: {error.strerror}") from error
-        self._schemas: dict[Any, int] = {}
+        self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[Any, int] = {}
-        self._known: dict[Any, list[tuple[Signature, int]]] = {}
+        self._known: dict[Any, list[tuple[Schema, int]]] = {}
         self._count = 0
         self._new: list[Any] = []
         # When the last chunk was closed, and how many messages wait in the open one.
@@ -77,10 +79,11 @@ class Sink:
 
     def json(self, path: Path, role: Role, kind: Kind, document: JsonMessage, stamp: tuple[int, int, int]) -> int:
         """Write a JSON message; returns its bytes. `stamp` is log time and publish time in ns, and a number."""
-        found = signature(document.tree) if role == Role.UPDATE else OPEN
-        return self._message(self._json_channel(path, role, kind, document.wrapped, found), [document.text], stamp)
+        found = schema_of(document.tree) if role == Role.UPDATE else None
+        channel = self._json_channel(path, role, kind, document.wrapped, found or OPEN)
+        return self._message(channel, [document.text], stamp)
 
-    def _json_channel(self, path: Path, role: Role, kind: Kind, wrapped: bool, found: Signature) -> int:
+    def _json_channel(self, path: Path, role: Role, kind: Kind, wrapped: bool, found: Schema) -> int:
         place = path, role, kind, wrapped
         known = self._known.get(place, [])
         for types, channel in known:
@@ -90,9 +93,10 @@ class Sink:
         # A path that changes its type all the time gets a schema without types.
         if len(known) == _MOST_SCHEMAS:
             found = OPEN
-        name = f"reem.{show(path)}" if role == Role.UPDATE else f"reem.{role}"
         # All channels of a shared topic have one schema: viewers want that.
-        schema = self._schema(name if role == Role.UPDATE else "reem.event", "jsonschema", found)
+        title = f"reem.{show(path)}" if role == Role.UPDATE else "reem.event"
+        text = orjson.dumps({"$schema": _DRAFT, "title": title, **found})
+        schema = self._schema(title, "jsonschema", text)
         extra = {"reem.wrapped": "1"} if wrapped else {}
         channel = self._channel(path, role, kind, "json", schema, **extra)
         self._known[place] = [*known, (found, channel)]
@@ -105,17 +109,15 @@ class Sink:
         channel = self._channels.get(key)
         if channel is None:
             self._check_room()
-            schema = self._schema(encoded.schema, "protobuf", None)
+            schema = self._schema(encoded.schema, "protobuf", schema_bytes(encoded.schema))
             extra = {"reem.ship": label, **({"reem.channels": encoded.channels} if encoded.channels else {})}
             channel = self._channels[key] = self._channel(path, role, kind, "protobuf", schema, **extra)
         return self._message(channel, encoded.pieces, stamp)
 
-    def _schema(self, name: str, encoding: str, known: Signature) -> tuple[int, str]:
-        key = name, encoding, known
-        if key not in self._schemas:
-            text = schema_bytes(name) if encoding == "protobuf" else schema_text(name, known)
-            self._schemas[key] = self._writer.register_schema(name, encoding, text)
-        return self._schemas[key], name
+    def _schema(self, name: str, encoding: str, text: bytes) -> tuple[int, str]:
+        if (name, text) not in self._schemas:
+            self._schemas[name, text] = self._writer.register_schema(name, encoding, text)
+        return self._schemas[name, text], name
 
     def _check_room(self) -> None:
         """Raise FullError if there can be no other channel; before it has a schema, which have 16 bits, too."""
@@ -167,63 +169,35 @@ class Sink:
         self.output.close()
 
 
-Signature = Any
-"""The types in a message: a str for a plain value, a tuple of pairs for an object, a set of one for an array,
-None where any value may be."""
+Schema = dict[str, Any]
+"""A JSON schema. An object may have more than it names, so what has no type that viewers take is left out."""
 
-OPEN: Signature = ()
-"""An object of which nothing is known."""
+OPEN: Schema = {"type": "object", "properties": {}, "additionalProperties": True}
+_NUMBER: Schema = {"type": "number"}
+_PLAIN: dict[type, Schema] = {float: _NUMBER, int: _NUMBER, str: {"type": "string"}, bool: {"type": "boolean"}}
 
 
-def signature(value: Any) -> Signature:
+def schema_of(value: Any) -> Schema | None:
+    """Return the schema of a JSON value; None of null and of an array of mixed items, which any schema lets pass."""
     kind = type(value)
-    if kind is float or kind is int:
-        return "number"
-    if kind is str:
-        return "string"
-    if kind is bool:
-        return "boolean"
+    if kind in _PLAIN:
+        return _PLAIN[kind]
     if kind is dict:
-        return tuple([(key, signature(item)) for key, item in value.items()])
-    if kind is list or kind is tuple:
-        return frozenset([signature(value[0])]) if value and _alike(value) else None
-    return None
-
-
-def _alike(items: Any) -> bool:
+        return {**OPEN, "properties": {key: schema for key, item in value.items() if (schema := schema_of(item))}}
     # For JSON, 1 and 1.5 are of one type.
-    kinds = {float if type(item) is int else type(item) for item in items}
-    return len(kinds) == 1
+    if kind not in (list, tuple) or len({float if type(item) is int else type(item) for item in value}) != 1:
+        return None
+    items = schema_of(value[0])
+    return {"type": "array", "items": items} if items else {"type": "array"}
 
 
-def fits(found: Signature, known: Signature) -> bool:
-    """Return whether a message with the types `found` may go under the schema of `known`."""
-    # null, or an array of mixed items: any schema lets it pass.
+def fits(found: Schema | None, known: Schema | None) -> bool:
+    """Return whether a message with the schema `found` may go under another one."""
     if found is None or known is None:
         return True
-    if type(found) is not type(known):
+    if found["type"] != known["type"]:
         return False
-    if type(found) is frozenset:
-        return fits(*found, *known)
-    if type(found) is tuple:
-        types = dict(known)
-        return all(fits(kind, types[key]) for key, kind in found if key in types)
-    return bool(found == known)
-
-
-def schema_text(title: str, known: Signature) -> bytes:
-    return orjson.dumps({"$schema": _DRAFT, "title": title, **_schema(known)})
-
-
-_DRAFT = "https://json-schema.org/draft/2020-12/schema"
-
-
-def _schema(known: Signature) -> dict[str, Any]:
-    if type(known) is frozenset:
-        (item,) = known
-        return {"type": "array"} if item is None else {"type": "array", "items": _schema(item)}
-    if type(known) is tuple:
-        # null and mixed arrays have no type that viewers take: the object is open, so they may be left out.
-        fields = {key: _schema(kind) for key, kind in known if kind is not None}
-        return {"type": "object", "properties": fields, "additionalProperties": True}
-    return {"type": known}
+    if found["type"] == "object":
+        types = known["properties"]
+        return all(fits(schema, types[key]) for key, schema in found["properties"].items() if key in types)
+    return fits(found.get("items"), known.get("items"))

@@ -6,6 +6,7 @@ and the place in the file. So a tree can be looked at, kept and written again wi
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -17,14 +18,39 @@ from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING, changed, get, mapped, removed, replaced
 from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip
-from .contents import Content
 from .format import Kind, Role
+from .output import slices
 
 _LONGEST_INLINE = 64
 """Numbers up to which an array or a list stays in the JSON: viewers draw a curve for each of them."""
 
 LOST = "lost"
 """The label of what could not be recorded."""
+
+
+class Content:
+    """The bytes of one value, which must not change; later only a digest of them, to compare it when it is read again.
+
+    Most values are never read again: a frame of a camera is replaced long before. So the bytes are kept until the next
+    keyframe, which digests those that are still there.
+    """
+
+    __slots__ = ("_digest", "_pieces")
+
+    def __init__(self, head: bytes, body: Any = b"") -> None:
+        self._pieces: tuple[bytes, Any] | None = head, body
+        self._digest = b""
+
+    def digest(self) -> bytes:
+        """Return 16 bytes that tell it from any other, and let go of its own."""
+        if self._pieces is not None:
+            head, body = self._pieces
+            total = hashlib.blake2b(digest_size=16, salt=hashlib.blake2b(head, digest_size=16).digest())
+            for part in slices([body]):
+                total.update(part)
+            # The digest takes the place of the bytes, which may be a frame of a camera.
+            self._digest, self._pieces = total.digest(), None
+        return self._digest
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,11 +23,22 @@ from ...plan.trees import MISSING, CannotApply, difference, get, replaced, same,
 from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
-from .contents import Content
 from .format import Kind, Role
 from .layout import WRAPPER, JsonMessage, encode, to_json
 from .sink import FullError, Sink
-from .stored import LOST, NotWritten, Reference, Unchanged, extract, opened, planted, pruned, reference_to, without
+from .stored import (
+    LOST,
+    Content,
+    NotWritten,
+    Reference,
+    Unchanged,
+    extract,
+    opened,
+    planted,
+    pruned,
+    reference_to,
+    without,
+)
 
 logger = logging.getLogger("reem.recording")
 

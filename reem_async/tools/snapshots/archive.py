@@ -19,7 +19,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -28,7 +28,8 @@ import orjson
 from ...errors import BadData
 from ...plan.keys import DOCUMENT
 from ...plan.paths import check_top_key, parse_suffix
-from .files import FIRST_MEMBER, NewFile, SavedKey, Snapshot
+from ..partfile import PartFile
+from .files import FIRST_MEMBER, SavedKey, Snapshot
 from .plans import REDIS_TYPES, KeyContent, Value, joined, split
 
 # Of the format: it grows when older programs would misread a file, not when something is added that they may ignore.
@@ -73,10 +74,11 @@ class ArchiveWriter:
     """Makes one portable snapshot, which has its name when `finish` has returned, or never."""
 
     def __init__(self, path: Path, header: dict[str, Any], *, overwrite: bool = False) -> None:
-        self._new = NewFile(path, overwrite=overwrite)
+        self._part = PartFile(path, replace=overwrite)
+        self._file: BinaryIO = self._part.path.open("r+b")
         # A file that cannot seek makes zipfile write sizes behind each member rather than going back to its head, which
         # would change bytes that are in the digest already.
-        self._hashed = _Hashed(self._new.file)
+        self._hashed = _Hashed(self._file)
         self._zip = zipfile.ZipFile(self._hashed, "w")
         self._keys: list[dict[str, Any]] = []
         try:
@@ -114,14 +116,17 @@ class ArchiveWriter:
         self._zip.comment = _COMMENT + _ZEROS
         self._zip.close()
         # Not through `_hashed`, which would count these bytes again.
-        self._new.file.seek(-len(_ZEROS), 2)
-        self._new.file.write(self._hashed.digest.hexdigest().encode())
-        self._new.commit()
+        self._file.seek(-len(_ZEROS), 2)
+        self._file.write(self._hashed.digest.hexdigest().encode())
+        self._file.close()
+        self._part.finish()
 
     def abandon(self) -> None:
         """Remove the file; a thread that is still writing to it gets an error."""
         self._zip.fp = None  # else its finalizer would write an index at some later time
-        self._new.discard()
+        with suppress(OSError):
+            self._file.close()
+        self._part.close()
 
     def _put(self, name: str, data: Any, method: int = zipfile.ZIP_STORED) -> None:
         # A zip file's own times are local and begin in 1980: every member has the same, the header has the real one.
@@ -194,6 +199,7 @@ class Archive:
             keys=keys,
             server=str(header["server"]),
             namespace=str(header["namespace"]),
+            match=str(header.get("match", "*")),
             unsaved={str(place): str(why) for place, why in index.get("unsaved", {}).items()},
         )
 

@@ -59,6 +59,9 @@ class Restored(NamedTuple):
 ProgressFunction = Callable[[Progress], None]
 
 
+def _unseen(_: Progress) -> None: ...
+
+
 async def save(
     interface: RedisInterface,
     path: str | os.PathLike[str],
@@ -96,7 +99,7 @@ async def save(
         FileExistsError: The file exists, or another program made it in between.
         OSError: The file cannot be written.
     """
-    session, target = interface.session, Path(path)
+    session, target, progress = interface.session, Path(path), progress or _unseen
     await anyio.to_thread.run_sync(lambda: check_target(target, overwrite=overwrite))
     found = await survey(session, match)
     # The time in the header is that of the beginning: no key was read before it.
@@ -118,12 +121,12 @@ async def save(
 
 
 async def _fill(
-    session: Session, writer: ArchiveWriter, found: Survey, progress: ProgressFunction | None
+    session: Session, writer: ArchiveWriter, found: Survey, progress: ProgressFunction
 ) -> tuple[int, Exception | None]:
     """Fetch and write the keys found; return how many were still there, and why the first that failed did."""
     count, failure = 0, None
     for number, name in enumerate(found.names):
-        _report(progress, "save", number, len(found.names))
+        progress(Progress("save", number, len(found.names)))
         try:
             content: KeyContent | None = await session.run(dump(session.keys(name)))
         except WrongKind:  # replaced by a program without REEM since it was found
@@ -137,7 +140,7 @@ async def _fill(
             for suffix in content.missing:
                 found.unsaved[name + suffix.partition("~")[0]] = "it is gone from the server, only its name is left"
             await anyio.to_thread.run_sync(writer.add, content)
-    _report(progress, "save", len(found.names), len(found.names))
+    progress(Progress("save", len(found.names), len(found.names)))
     return count, failure
 
 
@@ -173,7 +176,7 @@ async def restore(
         PartialWrite: The server, or the connection, failed behind some keys; the message says which were written.
         OSError: The file cannot be read.
     """
-    session, source = interface.session, Path(path)
+    session, source, progress = interface.session, Path(path), progress or _unseen
     await anyio.to_thread.run_sync(_check_file, source)
     archive = await anyio.to_thread.run_sync(Archive, source)
     with archive:
@@ -186,9 +189,9 @@ async def restore(
         done: list[str] = []
         size = 0
         for keys in names:
-            _report(progress, "restore", len(done), len(names))
+            progress(Progress("restore", len(done), len(names)))
             size += await _put(session, archive, keys, done, replace=replace)
-        _report(progress, "restore", len(done), len(names))
+        progress(Progress("restore", len(done), len(names)))
     return Restored(tuple(done), size)
 
 
@@ -254,11 +257,6 @@ def _after(why: str, done: Sequence[str]) -> str:
         return f"{why}; nothing was written"
     why = why.replace(", nothing was written", "")
     return f"{why}. Written before that: {len(done)} keys, from {done[0]!r} to {done[-1]!r}"
-
-
-def _report(progress: ProgressFunction | None, doing: str, done: int, total: int) -> None:
-    if progress is not None:
-        progress(Progress(doing, done, total))
 
 
 # Which keys of a server are REEM's, found by SCAN.

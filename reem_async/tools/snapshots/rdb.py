@@ -18,7 +18,8 @@ import anyio.to_thread
 from ...connection import RedisInterface
 from ...errors import ReemError
 from ...plan import Plan, Reply
-from .files import NewFile, Snapshot, check_target
+from ..partfile import PartFile
+from .files import Snapshot, check_target
 
 # Between two requests of INFO: a save of a small server takes some milliseconds, of a large one minutes.
 _POLL_SECONDS = 0.05
@@ -126,15 +127,14 @@ async def _finished(interface: RedisInterface, source: Path, before: Identity) -
 
 
 async def _copy(source: Path, target: Path, *, overwrite: bool) -> None:
-    new = NewFile(target, overwrite=overwrite)
+    part = PartFile(target, replace=overwrite)
     try:
-        with source.open("rb") as origin:
-            while await anyio.to_thread.run_sync(lambda: new.file.write(origin.read(_BLOCK))):
+        with source.open("rb") as origin, part.path.open("wb") as copy:
+            while await anyio.to_thread.run_sync(lambda: copy.write(origin.read(_BLOCK))):
                 pass
-        await anyio.to_thread.run_sync(new.commit)
-    except BaseException:
-        new.discard()
-        raise
+        await anyio.to_thread.run_sync(part.finish)
+    finally:
+        part.close()
 
 
 def describe_rdb(path: Path) -> Snapshot:
