@@ -64,6 +64,6 @@ __all__ = [
     "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
     "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady",
     "ServerReadOnly", "ServiceError", "ServiceLost", "Shape", "Silent", "SilentSubscriber", "SpecialDatatypeShip",
-    "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind",
-    "WrongLoop", "WrongType", "timeout",
+    "Stale", "StateChange", "TlsRefused", "TooDeep", "TooLarge", "Unreadable", "Update", "WriteOnly", "Writer",
+    "WrongKind", "WrongLoop", "WrongType", "timeout",
 ]  # fmt: skip

@@ -11,6 +11,7 @@ from ._twin import FOLLOWER, calls, documented_by, makes, runs, shares
 from .accessor import Accessor, PublishAccessor, known_keys
 from .connection import RedisInterface
 from .following import Join
+from .raw import RawKeys
 from .subscribe import PatternWatch
 
 
@@ -66,6 +67,12 @@ class KeyValueStore:
     set = runs(core.KeyValueStore.set)
     watch = makes(core.KeyValueStore.watch, PatternWatch, FOLLOWER)
     join = makes(core.KeyValueStore.join, Join, FOLLOWER)
+
+    @property
+    def raw(self) -> RawKeys:
+        """Keys of programs without REEM, as these wrote them: `kvs.raw["sai::q"].read()`."""
+        return RawKeys(self.interface)
+
     track_schema_changes = calls(core.KeyValueStore.track_schema_changes)
     _ipython_key_completions_ = known_keys
 
@@ -100,6 +107,7 @@ class PublishSpace(KeyValueStore):
     waiting = shares(core.PublishSpace.waiting)
     watch = calls(core.PublishSpace.watch)
     join = calls(core.PublishSpace.join)
+    raw: Any = shares(core.PublishSpace.raw)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface, *self._core._chosen)

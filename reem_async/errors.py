@@ -54,6 +54,7 @@ __all__ = [
     "Stale",
     "TlsRefused",
     "TooDeep",
+    "TooLarge",
     "WriteOnly",
     "WrongKind",
     "WrongLoop",
@@ -234,6 +235,10 @@ class RemoteError(ServiceError):
         return RemoteError, (self._where, self.type_name, self.message, self.traceback)
 
 
+class TooLarge(ReemError):
+    """The key of another program is larger than a read may fetch; `largest=` says how much that is."""
+
+
 class BadData(ReemError, ValueError):
     """The server holds or sent something that REEM does not write; it was not trusted."""
 
@@ -269,7 +274,7 @@ class WrongKind(ReemError, redis.exceptions.ResponseError):
     def __init__(self, key: str, where: str, kind: str = "another type", *, text: bool = False) -> None:
         foreign = (
             f"the Redis key {key!r} holds a value of type {kind} (a program without REEM wrote it), not a document; "
-            "choose another name, or remove that key"
+            f"kvs.raw[{key!r}] reads it"
         )
         moved = (
             f"the document under the Redis key {key!r} is text, as servers without JSON keep it, and this one has "

@@ -94,6 +94,10 @@ class BoundedQueue:
         self.dropped = 0  # how many updates were skipped and will never be taken out
         self.wake: Callable[[], None] = noop  # called after each change, from the putting thread
 
+    @property
+    def is_empty(self) -> bool:
+        return not self._items
+
     def put(self, update: Any) -> None:
         if self._end is not None:
             return

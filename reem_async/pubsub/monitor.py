@@ -50,6 +50,8 @@ class Event:
         stored: It was not published: it was found to be stored, at `time`, which is that of `received`. A `Monitor`
             yields none of these; commands that also follow the store do.
         local: Programs of the publisher's user and host can take the value from its memory.
+        raw: The Redis type of a key of another program, else empty. A `Monitor` tells of no such keys either.
+        changes: How many changes it stands for: of such a key several in a moment are one.
     """
 
     path: Path
@@ -65,6 +67,8 @@ class Event:
     namespace: str = ""
     stored: bool = False
     local: bool = False
+    raw: str = ""
+    changes: int = 1
 
     @property
     def name(self) -> str:

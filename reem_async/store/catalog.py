@@ -11,7 +11,7 @@ from ..connection import RedisInterface
 from ..errors import MissingKey
 from ..plan import Plan, Reply
 from ..plan.paths import Path, parse, parse_pattern, shorten, show
-from ..plan.placeholders import Placeholder, find, marked
+from ..plan.placeholders import Placeholder, Unfetched, find, marked
 from ..plan.reads import get_command, present
 from ..plan.replies import from_front, lengths, loads
 
@@ -98,19 +98,22 @@ async def outline(interface: RedisInterface, path: str | Path) -> Outline:
         if marked(text):
             for slot in find(holder, keys.name):
                 slot.container[slot.key] = slot.placeholder
-        return _outlined(holder[0], (keys.name, *from_front(replies[1:], keys, below, MissingKey)))
+        return outlined(holder[0], (keys.name, *from_front(replies[1:], keys, below, MissingKey)))
 
     # A transaction only where the path counts from the end of a list: its length is to be of the same instant.
     it: Outline = await interface.session.run(Plan([get_command(keys, below), *counted], decode, atomic=bool(counted)))
     return it
 
 
-def _outlined(value: Any, path: Path) -> Outline:
-    if isinstance(value, Placeholder):
+def outlined(value: Any, path: Path) -> Outline:
+    """Return the outline of a value that was read, with placeholders for what was not."""
+    if isinstance(value, Placeholder | Unfetched):
         return Outline(path, value.label, value.summary, None, value.size)
+    if isinstance(value, bytes):
+        return Outline(path, "bytes", "bytes", None, len(value))
     if isinstance(value, dict | list):
         pairs = value.items() if isinstance(value, dict) else enumerate(value)
-        children = tuple([_outlined(item, (*path, key)) for key, item in pairs])
+        children = tuple([outlined(item, (*path, key)) for key, item in pairs])
         return Outline(path, type(value).__name__, "", None, sum(child.size for child in children), children)
     size = len(value.encode()) if isinstance(value, str) else 8
     return Outline(path, type(value).__name__, "", value, size)

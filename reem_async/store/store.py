@@ -19,6 +19,7 @@ from .accessor import Accessor, Writer
 from .catalog import names
 from .document import DocumentReader, DocumentWriter
 from .publish import DocumentPublisher
+from .raw import RawKeys
 from .send_queue import outages
 
 _MOST_TOPS = 1000  # accessors of top-level keys that are cached
@@ -182,6 +183,11 @@ class KeyValueStore:
         places = [self.at(path) for path in paths]
         return Join(self.interface.session, [(it._reader.keys, it._path) for it in places], slop, policy)
 
+    @property
+    def raw(self) -> RawKeys:
+        """Keys of programs without REEM, as these wrote them: `kvs.raw["sai::q"].read()`."""
+        return RawKeys(self.interface.session)
+
     async def setdefault(self, key: str, default: Any = None) -> Any:
         """Return the value of a top-level key; where it is not there, store `default` first.
 
@@ -320,6 +326,11 @@ class PublishSpace(KeyValueStore):
     def join(self, *paths: str, slop: float, policy: Any = None) -> NoReturn:
         """Raise WriteOnly."""
         raise WriteOnly(_cannot_read(paths or ("*",)))
+
+    @property
+    def raw(self) -> NoReturn:
+        """Raise WriteOnly: what other programs store has no subscribers of REEM. Use a KeyValueStore."""
+        raise WriteOnly("a PublishSpace has no .raw: use that of KeyValueStore(interface)")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface, *self._chosen)

@@ -71,8 +71,10 @@ def slot_of(commands: Sequence[Command]) -> int | None:
 
 
 def _slot(command: Command) -> int | None:
-    # All commands that REEM sends have their key behind their name, and all of a plan have the same hash tag.
-    return None if len(command) < 2 or command[0] in _KEYLESS else _slot_of_word(command[1])
+    # All commands that REEM sends but one have their key behind their name. All of a plan have the same hash tag.
+    if len(command) < 2 or command[0] in _KEYLESS:
+        return None
+    return _slot_of_word(command[2] if command[0] == "MEMORY" else command[1])
 
 
 @lru_cache(maxsize=4096)

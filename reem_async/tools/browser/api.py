@@ -176,7 +176,7 @@ class Api:
         routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         routes.append(Route("/node", told(self.node), methods=["GET"]))
         routes.append(Route("/json", answered(self.json), methods=["GET"]))
-        return [*routes, Route("/write", answered(self.write), methods=["POST"])]
+        return [*routes, *(Route(f"/{it.__name__}", answered(it), methods=["POST"]) for it in (self.write, self.hint))]
 
     async def tree(self, request: Request) -> Response:
         """Return the items of all open branches, what changed since an instant marked."""
@@ -266,6 +266,20 @@ class Api:
         """Publish a value, if that is allowed, and asked by a page from here."""
         if not self.allow_write:
             raise RefusedRequest(403, "this page is read-only; start it with: reem browse --allow-write")
+        path, value = await self._asked_by_own_page(request)
+        await self._source.write(path, value)
+        return reply({"written": address(path)})
+
+    async def hint(self, request: Request) -> Response:
+        """Note what the bytes of another program are, for this start of the page; nothing is written."""
+        path, text = await self._asked_by_own_page(request)
+        if not isinstance(text, str):
+            raise RefusedRequest(400, 'the value is text, such as "uint8[480,640,3]"')
+        self._source.hint(path, text)
+        return reply({"shown as": text})
+
+    async def _asked_by_own_page(self, request: Request) -> tuple[Path, Any]:
+        """Return the path and the value that a page from here sends."""
         if not same_origin(request.headers):
             raise RefusedRequest(403, "this did not come from a page of this program")
         offered = request.headers.get("x-reem-key", "")
@@ -278,8 +292,7 @@ class Api:
         path = path_of(content["path"])
         if not path:
             raise RefusedRequest(400, "a top-level key is needed")
-        await self._source.write(path, content["value"])
-        return reply({"written": address(path)})
+        return path, content["value"]
 
 
 def _control(it: StoredParameter) -> dict[str, Any]:

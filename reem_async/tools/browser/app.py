@@ -282,7 +282,7 @@ def _view(source: Source, api: Api) -> Callable[[Request], Awaitable[Response]]:
             "title": source.title,
             "live": source.live,
             "write": api.allow_write,
-            "key": api.key if api.allow_write else "",
+            "key": api.key,
             **source.status()._asdict(),
         }
         return HTMLResponse(template.replace("{config}", html.escape(orjson.dumps(config).decode())))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import reduce
 from operator import getitem
 from typing import Any
@@ -20,6 +21,7 @@ from ...store.store import PublishSpace
 from .follower import Follower
 from .history import History
 from .partial_reads import keys_at, peek
+from .raw import RawFollower
 from .source import Node, NotKept, Page, Sample, Series, Status, counted, matching, node_of, numbers_in, snippets
 from .timeline import UNKNOWN
 from .trees import Frame, differing, thawed
@@ -55,14 +57,17 @@ class LiveSource:
         self.title = interface.hostname + (f" · {interface.namespace}" if interface.namespace else "")
         self.history = History(seconds, budget)
         self._follower = Follower(interface, self.history)
+        self._raw = RawFollower(interface.session, self.history)
         self._shared: dict[Path, asyncio.Task[Any]] = {}
         self._space: Any = PublishSpace(interface)
 
     async def start(self) -> None:
         """Connect and begin to follow. Idempotent; raises NotConnected and the like."""
         await self._follower.start()
+        await self._raw.start()
 
     async def close(self) -> None:
+        await self._raw.close()
         await self._follower.close()
         await self.interface.close()
 
@@ -72,6 +77,8 @@ class LiveSource:
             notes.append(f"{self._follower.monitor.dropped} updates came too fast to be kept")
         if not self._follower.hears_of_changes:
             notes.append(_UNTOLD)
+        if self._raw.refused:
+            notes.append(self._raw.refused)
         end = self.history.clock.now()
         return Status(
             min(max(self.history.start, end - self.history.seconds), end), end, self._follower.lost, "; ".join(notes)
@@ -81,7 +88,15 @@ class LiveSource:
         self._follower.shown_on(pages)
 
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
-        return snippets(path, self.interface.session.options.url, self.interface.namespace)
+        return snippets(path, self.interface.session.options.url, self.interface.namespace, raw=self._is_raw(path))
+
+    def _is_raw(self, path: Path) -> bool:
+        """Return whether a path leads into a key of another program, all of which the buffer has."""
+        return bool(path) and path[0] in self._raw.kinds
+
+    def hint(self, path: Path, text: str) -> None:
+        """Say what the bytes at a path of another program are; see `RawFollower.hint`."""
+        self._raw.hint(path, text)
 
     # --- the tree
 
@@ -89,7 +104,9 @@ class LiveSource:
         """Return what is at each path: three round trips at most."""
         when = self.history.clock.now() if at is None else at
         # What has not changed since an instant is still there: it is asked of the server, and costs no memory here.
-        now = [path for path in paths if at is None or self.history.unchanged(path[:1], at)]
+        now = [
+            path for path in paths if not self._is_raw(path) and (at is None or self.history.unchanged(path[:1], at))
+        ]
         try:
             found = dict(zip(now, await peek(self.interface.session, now), strict=True))
         except _AWAY:
@@ -100,7 +117,7 @@ class LiveSource:
             if path not in found:
                 found[path] = self._past(path, when)
         last = self.history.last(paths, when)
-        return [self._stamped(found[path], last, when) for path in paths]
+        return [self._stamped(found[path], last, at, when) for path in paths]
 
     def _past(self, path: Path, at: float) -> Node | None:
         value = self.history.tree(path, at)
@@ -108,11 +125,15 @@ class LiveSource:
             return Node(path, "unknown", "not kept for this instant")
         return None if value is MISSING else node_of(path, value)
 
-    def _stamped(self, node: Node | None, last: dict[Path, float], when: float) -> Node | None:
+    def _stamped(self, node: Node | None, last: dict[Path, float], at: float | None, when: float) -> Node | None:
         if node is None:
             return None
-        rate = self.history.rate(str(node.path[0]), when) if len(node.path) == 1 else None
-        return node.stamped(last.get(node.path), rate)
+        name = str(node.path[0])
+        raw = self._raw.kinds.get(name, "")
+        rate = self.history.rate(name, when) if len(node.path) == 1 else None
+        if raw and at is None and len(node.path) == 1:
+            rate = self._raw.rate(name)
+        return replace(node, time=last.get(node.path), rate=rate, raw=raw)
 
     async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
         """Return some of what is below a path: four round trips at most."""
@@ -122,7 +143,7 @@ class LiveSource:
         return Page(len(keys), start, [node for node in nodes if node is not None])
 
     def _names(self, at: float | None) -> Sequence[str]:
-        names = self._follower.names
+        names = self._follower.names | self._raw.kinds.keys()
         if at is None:
             return sorted(names)
         # None: not known, so what is there now is taken to have been there then.
@@ -131,7 +152,9 @@ class LiveSource:
         return sorted(present | {name for name, existed in known.items() if existed})
 
     async def _keys(self, path: Path, at: float | None) -> Sequence[str | int]:
-        if at is None or self.history.unchanged(path[:1], at):
+        if self._is_raw(path):
+            at = self.history.clock.now() if at is None else at
+        elif at is None or self.history.unchanged(path[:1], at):
             try:
                 keys = await keys_at(self.interface.session, path)
                 if keys is None:
@@ -153,7 +176,9 @@ class LiveSource:
         """Return the value at a path, arrays included; readings of the same moment are shared."""
         name = str(path[0])
         # Of arrays that the server does not tell of, the present does not speak for the past.
-        if at is None or (self.history.unchanged(path, at) and self._follower.is_settled(name)):
+        if self._is_raw(path):
+            at = self.history.clock.now() if at is None else at
+        elif at is None or (self.history.unchanged(path, at) and self._follower.is_settled(name)):
             try:
                 return Sample(await self._read(path), 0.0, self._age(path, at))
             except _AWAY:
@@ -220,6 +245,8 @@ class LiveSource:
             BadType: An array is there, or nothing at all below the top level.
             BadType, BadValue: A program has declared a parameter there, and does not allow the value.
         """
+        if self._is_raw(path):
+            raise BadType(f"{show(path)} is of another program, and a page only shows it; use kvs.raw in Python")
         # Not `parameters`: a key that was just made is among the names a second later.
         found, _ = await stored_parameters(self.interface.session, path)
         if (it := found.get(path)) is not None:
@@ -265,7 +292,7 @@ class LiveSource:
 
     async def series(self, path: Path, start: float, end: float) -> Series:
         samples = list(self.history.values(path, max(start, self.history.start), end))
-        if not samples:
+        if not samples and not self._is_raw(path):
             (node,) = await peek(self.interface.session, [path])
             if node is not None and (node.text if node.size is None else node.size <= _SHORT):
                 samples = [(end, await self._read(path))]

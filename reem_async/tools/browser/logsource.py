@@ -162,6 +162,9 @@ class LogSource(Source):
     async def write(self, path: Path, value: Any) -> None:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")
 
+    def hint(self, path: Path, text: str) -> None:
+        raise ReadOnly("what bytes are can be said on the page of a server, and not of a recording")
+
 
 def _unfetched(it: Any) -> Any:
     return Unfetched(it.label, it.size, it.summary) if type(it) is ArrayHandle else it

@@ -39,12 +39,13 @@ def path_of(text: str) -> Path:
     return path
 
 
-def snippets(path: Path, url: str, namespace: str) -> dict[str, str]:
-    """Return Python that reads a path from a server, for both fronts."""
+def snippets(path: Path, url: str, namespace: str, *, raw: bool = False) -> dict[str, str]:
+    """Return Python that reads a path from a server, for both fronts; `raw` if it is of another program."""
     # As far as a path can lead; the rest is taken out of what was read, in Python.
     reach = next((index for index, key in enumerate(path) if index and not is_addressable(key)), len(path))
+    reach = min(reach, 1) if raw else reach
     where, below = ("".join([f"[{key!r}]" for key in keys]) for keys in (path[:reach], path[reach:]))
-    read = f"kvs{where}.read()"
+    read = f"kvs{'.raw' if raw else ''}{where}.read()"
     awaited = f"(await {read}){below}" if below else f"await {read}"
     interface = f"RedisInterface({url!r}" + (f", namespace={namespace!r})" if namespace else ")")
     return {
@@ -91,6 +92,7 @@ class Node:
     value: Any = None  # a number, bool or None as it is; else None
     time: float | None = None  # when it was last seen to change, in seconds since 1970; None if that is not known
     rate: float | None = None  # updates per second of late; None if that is not known
+    raw: str = ""  # the Redis type, if it is of another program
 
     def stamped(self, when: float | None, rate: float | None) -> Node:
         return replace(self, time=when, rate=rate)
@@ -107,6 +109,7 @@ class Node:
             "count": self.count,
             "time": self.time,
             "rate": self.rate,
+            "raw": self.raw,
         }
 
 
@@ -216,6 +219,9 @@ class Source(Protocol):
     async def value(self, path: Path, at: float | None) -> Sample: ...
     async def search(self, text: str, at: float | None, most: int) -> list[Path]: ...
     async def write(self, path: Path, value: Any) -> None: ...
+
+    # Says what the bytes of another program are, such as "uint8[480,640,3]".
+    def hint(self, path: Path, text: str) -> None: ...
 
     # What programs have declared at and below a path.
     async def parameters(self, path: Path) -> list[StoredParameter]:

@@ -30,6 +30,7 @@ from .checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
 from .following import follow
 from .options import DEFAULT_URL, AsJson, Namespace, Url
 from .output import clean, emit, emit_json, is_terminal, styled, width
+from .raw import how_many, raw_listed
 from .running import FAILED, for_users, interface_to, run_local
 from .top import ALL, Board
 
@@ -131,6 +132,7 @@ async def _findings(url: str, namespace: str, *, clean: bool) -> AsyncIterator[t
                 yield name, Finding("server", FAIL, for_users(error))
         yield "", await _old_data(interface)
         yield "", await _orphans(interface, clean=clean)
+        yield "", await _others(interface)
         yield "", await _publishers(interface)
         yield "", await _sharing()
     except RedisError as error:
@@ -218,6 +220,16 @@ async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
         else:
             counts |= {name: len(found)} if found else {}
     return checks.orphans(counts, unknown, removed=clean)
+
+
+async def _others(interface: RedisInterface) -> Finding:
+    """Count the keys of programs without REEM."""
+    try:
+        names = await raw_listed(interface.session)
+    except RedisError as error:
+        return Finding("raw keys", UNKNOWN, f"not all keys can be looked at: {for_users(error)}")
+    text = f"{how_many(names)}; kvs.raw and the tools read them" if names else "no program without REEM stores a key"
+    return Finding("raw keys", OK, text)
 
 
 def _info(reply: Any) -> Mapping[str, str] | None:

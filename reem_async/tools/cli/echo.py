@@ -2,33 +2,44 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import aclosing, suppress
 from datetime import datetime
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from ...connection import RedisInterface
 from ...errors import MissingKey, RedisError, ReemError
 from ...plan.paths import Path, Pattern, parse_pattern, spelled_out
 from ...plan.placeholders import Unfetched
+from ...plan.raw import plain_value
 from ...plan.trees import MISSING, get, mapped
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...store.catalog import outline
+from .channel import ChannelMessages
 from .following import Ending, follow
-from .listing import as_data, describe, found
+from .listing import as_data, describe, found_all
 from .options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
 from .output import clean, cut, emit, emit_json, is_terminal, json_text, note, size_text, styled, typed, width
 from .running import run
+
+_LARGEST = 1 << 16  # bytes of a key of another program that are fetched to be shown
 
 
 def echo(
     patterns: Patterns = None,
     count: Count = None,
     timeout: Timeout = None,
+    channel: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Print what programs send to this channel with plain PUBLISH, and no keys."),
+    ] = None,
     as_json: AsJson = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
@@ -38,15 +49,19 @@ def echo(
     A published update has one line, with the time of the publisher's clock. Plain writes are marked as stored, with
     the time at which they were found; several in a moment may share one line. Of an update of a whole dict, the part
     at the given path is printed. Values over 16 KB do not travel with the notice: size, type and shape are printed.
-    Lines that begin with # report lost and skipped updates; in JSON they are "missed", "gap" and "skipped". A terminal
-    cuts long lines, a pipe does not.
+    Changes of keys of programs without REEM are marked with their Redis type, such as (raw hash). They are read up to
+    20 times a second, and up to 64 KB. Lines that begin with # report lost and skipped updates; in JSON they are
+    "missed", "gap" and "skipped". A terminal cuts long lines, a pipe does not.
 
     Examples:
         reem echo
         reem echo processed_info 'robot.*.battery'
         reem echo set_point --count 1 --timeout 5 --json | jq .value
         reem echo raw_image | cat
+        reem echo --channel events
     """
+    if channel and patterns:
+        raise typer.BadParameter("--channel goes with no pattern: it prints what is sent to the channel alone")
 
     async def work(interface: RedisInterface) -> int:
         skipped = 0
@@ -67,9 +82,35 @@ def echo(
             sys.stdout.flush()
 
         await _say_what_is_waited_for(interface, patterns or ())
-        return (await follow(interface, patterns or (), take, count=count, seconds=timeout, stored=True)).tell()
+        if channel:
+            return await _messages(interface, channel, count, timeout, as_json=as_json)
+        ends: dict[str, Any] = {"count": count, "seconds": timeout}
+        return (await follow(interface, patterns or (), take, **ends, stored=True, raw=_LARGEST)).tell()
 
     run("echo", work, url, namespace, live=True)
+
+
+async def _messages(
+    interface: RedisInterface, channel: str, count: int | None, seconds: float | None, *, as_json: bool
+) -> int:
+    """Print the messages on a channel until there were `count`, the time is over, or Ctrl-C; return the exit code."""
+    ending, start = Ending(stored=True), time.monotonic()
+    with suppress(asyncio.CancelledError, TimeoutError):
+        async with asyncio.timeout(seconds), ChannelMessages(interface.session, channel) as messages:
+            async for payload in messages:
+                ending.taken += 1
+                value, now = plain_value(payload), time.time()
+                if as_json:
+                    emit_json({"channel": channel, "received": now, "value": value})
+                else:
+                    moment, name = styled(_moment(now), "dim"), styled(clean(channel), "bold")
+                    emit(f"{moment}  {name}  {_one_line(value)}")
+                    sys.stdout.flush()
+                if ending.taken == count:
+                    break
+    ending.seconds = time.monotonic() - start
+    ending.timed_out = seconds is not None and ending.taken < (count or 1)
+    return ending.tell()
 
 
 async def _kind(interface: RedisInterface, path: Path) -> str:
@@ -89,7 +130,7 @@ async def _say_what_is_waited_for(interface: RedisInterface, patterns: Sequence[
     for path in patterns:
         with suppress(ReemError, RedisError):
             try:
-                async with aclosing(found(interface, path)) as places:
+                async with aclosing(found_all(interface, path)) as places:
                     is_there = await anext(places, None) is not None
             except MissingKey:
                 is_there = False
@@ -125,6 +166,8 @@ def _for_programs(event: Event, skipped: int) -> dict[str, Any]:
         entry["value"] = mapped(event.value, _unfetched_as_text) if event.stored else event.value
     if event.stored:
         entry["stored"] = True
+    if event.raw:
+        entry |= {"raw": event.raw, "changes": event.changes}
     return entry | {"missed": event.missed, "gap": event.gap, "skipped": skipped}
 
 
@@ -138,6 +181,7 @@ def _for_people(event: Event, skipped: int, kind: str) -> list[str]:
     if skipped:
         lines.append(styled(f"# {skipped} updates were skipped: they came faster than they could be shown", "yellow"))
     moment, path = _moment(event.time), typed(event.path)
+    origin = f"raw {event.raw}" if event.raw else "stored" if event.stored else ""
     if event.deleted:
         what = "deleted"
     elif event.value is not ANNOUNCED:
@@ -146,20 +190,20 @@ def _for_people(event: Event, skipped: int, kind: str) -> list[str]:
         what = f"<{kind}{size_text(event.size)}, not fetched>" if event.size else "<changed, not fetched>"
     # The path has at most half of the line, the value the rest.
     if is_terminal():
-        room = width() - len(moment) - 4 - 10 * event.stored
+        room = width() - len(moment) - 4 - (len(origin) + 4) * bool(origin)
         path = cut(path, max(room // 2, 8))
         what = cut(what, max(room - len(path), 16))
     colour = "red" if event.deleted else "cyan" if event.value is ANNOUNCED else ""
-    mark = f"  {styled('(stored)', 'dim')}" if event.stored else ""
+    mark = f"  {styled(f'({origin})', 'dim')}" if origin else ""
     lines.append(f"{styled(moment, 'dim')}  {styled(path, 'bold')}  {styled(what, colour) if colour else what}{mark}")
     return lines
 
 
-def _moment(time: float) -> str:
+def _moment(when: float) -> str:
     try:
-        return datetime.fromtimestamp(time).strftime("%H:%M:%S.%f")
+        return datetime.fromtimestamp(when).strftime("%H:%M:%S.%f")
     except (ValueError, OverflowError, OSError):  # a publisher's clock may be set to anything
-        return f"{time:g} s"
+        return f"{when:g} s"
 
 
 def _one_line(value: Any) -> str:

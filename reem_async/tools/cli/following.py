@@ -6,22 +6,26 @@ import asyncio
 import contextlib
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ...concurrency.queues import Last
+from ...concurrency.streams import Stream
 from ...connection import RedisInterface
-from ...errors import ReemError
+from ...errors import NotAllowed, ReemError
 from ...plan.notices import LARGEST_INLINE
 from ...plan.paths import parse_shown
 from ...pubsub.monitor import Event, Monitor
 from ...pubsub.pattern_watch import PatternWatch
+from ...pubsub.raw_watch import RawWatch
 from .output import counted, emit_json, note, write_over
 from .running import TIMED_OUT
 
 _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""
+
+_PACE = 0.05  # seconds between two readings of such keys: people read no faster
 
 _NEVER = float("inf")
 
@@ -63,10 +67,12 @@ async def follow(
     every: float | None = None,
     tick: Callable[[Ending], None] = lambda _: None,
     stored: bool = False,
+    raw: int | None = None,
 ) -> Ending:
     """Hand each update to `take` until there were `count`, `seconds` are over, or Ctrl-C; call `tick` in between.
 
-    With `stored`, plain writes are handed on, too; arrays of over 16 KB are not fetched for that.
+    With `stored`, plain writes are handed on, too; arrays of over 16 KB are not fetched for that. With `raw`, changes
+    of keys of other programs are, which are fetched up to so many bytes.
     """
     ending, start = Ending(), time.monotonic()
     end = start + seconds if seconds else _NEVER
@@ -75,7 +81,12 @@ async def follow(
     monitor = Monitor(interface, patterns or ("*",), Last(_WAITING))
     ending.stored = stored
     try:
-        async with monitor, _stores(interface, patterns, monitor) if stored else contextlib.nullcontext():
+        async with contextlib.AsyncExitStack() as stack:
+            await stack.enter_async_context(monitor)
+            if stored:
+                await stack.enter_async_context(_stores(interface, patterns, monitor))
+            if raw is not None:
+                await stack.enter_async_context(_others(interface, monitor, raw))
             while ending.taken != count:
                 # Wakes for the next report too, since a table must age while nothing is published.
                 event = await _next(monitor, min(end, next_tick))
@@ -117,7 +128,41 @@ async def _stores(interface: RedisInterface, patterns: Sequence[str], monitor: M
                 path, now = parse_shown(update.path), time.time()
                 monitor.queue.put(Event(path, update.value, update.deleted, 0, now, now, "", 0, stored=True))
 
-    task = asyncio.create_task(hand_on())
+    async with _handing_on(hand_on, watch):
+        yield
+
+
+@contextlib.asynccontextmanager
+async def _others(interface: RedisInterface, monitor: Monitor, largest: int) -> AsyncIterator[None]:
+    """Have changes of keys of other programs come out of a monitor, too, unless there is a namespace."""
+    tops = [pattern.top for pattern in monitor.patterns]
+    watch = RawWatch(interface.session, tops, Last(_WAITING), largest, pace=_PACE, lazy=True)
+    try:
+        if interface.namespace:
+            await watch.close()
+        else:
+            await watch.listen()
+    except ReemError as error:
+        note(f"keys of programs without REEM are not shown: {error}")
+        await watch.close()
+
+    async def hand_on() -> None:
+        try:
+            async for update in watch:
+                if update.origin == "stored":
+                    path, now = (update.path,), time.time()
+                    event = Event(path, update.value, update.deleted, update.size, now, now, "", 0, stored=True)
+                    monitor.queue.put(replace(event, raw=update.kind, changes=update.changes))
+        except NotAllowed as error:
+            note(f"keys of programs without REEM are not shown: {error}")
+
+    async with _handing_on(hand_on, watch):
+        yield
+
+
+@contextlib.asynccontextmanager
+async def _handing_on(work: Callable[[], Coroutine[Any, Any, None]], watch: Stream[Any]) -> AsyncIterator[None]:
+    task = asyncio.create_task(work())
     try:
         yield
     finally:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from ...connection import RedisInterface
-from ...errors import BadData, MissingKey, WrongKind
+from ...errors import BadData, BadKey, MissingKey, ReemError, WrongKind
 from ...plan.paths import check_top_key, parse, parse_pattern
 from ...store.catalog import Outline, names, outline
 from .options import DEFAULT_URL, AsJson, Namespace, Url, complete_path
@@ -28,6 +28,7 @@ from .output import (
     typed,
     width,
 )
+from .raw import matching, raw_found
 from .running import NOTHING, for_users, run
 
 # Entries that are drawn of one dict or list: lists of thousands of numbers would fill the screen.
@@ -49,7 +50,8 @@ def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_UR
     """List keys with type and size.
 
     One line for each key that the pattern names: name, type, what it is, bytes. Arrays are not
-    fetched. Where the output is no terminal, tabs separate the columns.
+    fetched. Where the output is no terminal, tabs separate the columns. Keys of programs without REEM come
+    last. Their type is that of Redis, such as "raw hash".
 
     Exit code 3 if there is no such key.
 
@@ -65,12 +67,16 @@ def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_UR
         # All rows before the first is printed: the widths of the columns depend on them. JSON lines go out as they
         # come.
         rows = []
-        async for node in found(interface, pattern):
+        async for raw, node in found_all(interface, pattern):
             if as_json:
-                emit_json(outline_json(node, whole=False))
-            rows.append((typed(node.path), node.kind, describe(node, 48), size_text(node.size)))
+                emit_json(outline_json(node, raw, whole=False))
+            rows.append(
+                (typed(node.path), f"raw {raw}" if raw else node.kind, describe(node, 48), size_text(node.size))
+            )
         if not as_json:
             columns(rows, ("bold", "cyan", "", "green"), right=frozenset({3}), shrink=(2, 0))
+        if others := sum(row[1].startswith("raw ") for row in rows):
+            note(f"{counted(others, 'key')} of other programs, marked raw")
         return 0 if rows else _nothing(pattern, interface)
 
     run("ls", work, url, namespace)
@@ -87,7 +93,8 @@ def tree(
 ) -> None:
     """Show what is below keys; arrays as dtype, shape and size, without fetching them.
 
-    One round trip for each top-level key. Exit code 3 if there is no such key.
+    Keys of programs without REEM come last, marked with their Redis type, such as (raw hash). One round trip for
+    each top-level key. Exit code 3 if there is no such key.
 
     Examples:
         reem tree
@@ -98,13 +105,15 @@ def tree(
     async def work(interface: RedisInterface) -> int:
 
         count = 0
-        async for node in found(interface, pattern):
+        async for raw, node in found_all(interface, pattern):
             count += 1
             if as_json:
-                emit_json(outline_json(node, whole=True))
+                emit_json(outline_json(node, raw, whole=True))
                 continue
+            mark = styled(f"  (raw {raw})", "dim") if raw else ""
             for line in _drawn(node, typed(node.path), "", "", None if whole else _MOST_CHILDREN):
-                emit(line)
+                emit(line + mark)
+                mark = ""
         return 0 if count else _nothing(pattern, interface)
 
     run("tree", work, url, namespace)
@@ -146,6 +155,25 @@ def _key(node: Outline) -> str:
     return f"[{key}]" if isinstance(key, int) else typed((key,))
 
 
+async def found_all(interface: RedisInterface, pattern: str) -> AsyncGenerator[tuple[str, Outline], None]:
+    """Yield the outlines of all that a pattern names, those in keys of other programs with their Redis type.
+
+    Raises:
+        MissingKey, BadKey: The pattern is a path, and nothing is there, or no key can have that name.
+    """
+    missing: ReemError | None = None
+    try:
+        async for node in found(interface, pattern):
+            yield "", node
+    except (MissingKey, WrongKind, BadKey) as error:
+        missing = error
+    async for raw, node in raw_found(interface, pattern):
+        missing = None
+        yield raw, node
+    if missing is not None:
+        raise missing
+
+
 async def found(interface: RedisInterface, pattern: str) -> AsyncGenerator[Outline, None]:
     """Yield the outlines of all that a pattern names, by name. One round trip for each top-level key.
 
@@ -164,7 +192,7 @@ async def found(interface: RedisInterface, pattern: str) -> AsyncGenerator[Outli
     for start in range(0, len(tops), _AT_ONCE):
         for top in await asyncio.gather(*[_outline(interface, name) for name in tops[start : start + _AT_ONCE]]):
             if top is not None:
-                for node in _matching(top, wanted, 1 + len(wanted.rest)):
+                for node in matching(top, wanted, 1 + len(wanted.rest)):
                     yield node
 
 
@@ -176,16 +204,6 @@ async def _outline(interface: RedisInterface, name: str) -> Outline | None:
         return None
     except BadData as error:
         return Outline((name,), "?", for_users(error))
-
-
-def _matching(node: Outline, wanted: Any, depth: int) -> Iterator[Outline]:
-    if not wanted.concerns(node.path):
-        return
-    if len(node.path) == depth:
-        yield node
-        return
-    for child in node.children:
-        yield from _matching(child, wanted, depth)
 
 
 def describe(node: Outline, limit: int) -> str:
@@ -215,8 +233,10 @@ def as_data(node: Outline) -> Any:
     return f"<{node.summary or node.kind}, {size_text(node.size)}>"
 
 
-def outline_json(node: Outline, *, whole: bool) -> dict[str, Any]:
+def outline_json(node: Outline, raw: str = "", *, whole: bool) -> dict[str, Any]:
     entry: dict[str, Any] = {"path": typed(node.path), "type": node.kind, "size": node.size}
+    if raw:
+        entry["raw"] = raw  # the Redis type of a key of another program
     if node.plain:
         entry["value"] = node.value
     elif node.kind in ("dict", "list"):

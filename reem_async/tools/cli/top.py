@@ -188,9 +188,11 @@ class Board:
 
     def take(self, event: Event, _: Ending | None = None) -> None:
         path = event.path[:1] if self.view is ALL else event.path
-        shown = typed(path) + " (stored)" * event.stored
+        shown = typed(path) + (f" (raw {event.raw})" if event.raw else " (stored)" * event.stored)
         if shown in self.windows or len(self.windows) < _MOST_PATHS:
-            self.windows.setdefault(shown, Window()).add(event)
+            window = self.windows.setdefault(shown, Window())
+            for _unused in range(min(event.changes, _WINDOW)):
+                window.add(event)
 
     def rows(self) -> list[tuple[str, Window]]:
         return sorted(self.windows.items(), key=lambda row: row[0])
@@ -326,9 +328,9 @@ def _command(name: str, view: View, text: str, *, stored: bool = False) -> Calla
         period = 1.0 if timeout is None and count is None else None
 
         async def followed(interface: RedisInterface, period: float | None, tick: Callable[[Ending], None]) -> Ending:
-            return await follow(
-                interface, wanted, board.take, count=count, seconds=timeout, every=period, tick=tick, stored=stored
-            )
+            raw = None if view is DELAY else 0  # nothing says when they were written
+            ends: dict[str, Any] = {"count": count, "seconds": timeout}
+            return await follow(interface, wanted, board.take, **ends, every=period, tick=tick, stored=stored, raw=raw)
 
         async def work(interface: RedisInterface) -> int:
             if view is ALL:
@@ -360,7 +362,8 @@ top = _command(
 The columns of a top-level key: updates a second, bytes a second, delay, seconds since the last update, and how many
 programs publish it. A key with several publishers at once is marked, since each overwrites the other. "shared" says
 that large updates also go through shared memory, to programs on the publisher's host that asked for them. Nothing is
-fetched. Writes of a KeyValueStore do not count. The table of services has a line for each server, as `reem services`.
+fetched. Writes of a KeyValueStore do not count. Keys of programs without REEM are marked with their Redis type, such as
+(raw string). The table of services has a line for each server, as `reem services`.
 
 Examples:
     reem top

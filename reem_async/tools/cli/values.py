@@ -16,9 +16,9 @@ import numpy as np
 import typer
 
 from ...connection import RedisInterface
-from ...errors import MissingKey
-from ...plan.paths import Path as KeyPath
-from ...plan.paths import show
+from ...errors import BadKey, MissingKey, ReemError, WrongKind
+from ...plan.paths import parse, show
+from ...plan.raw import LARGEST, fetched
 from ...plan.trees import walk
 from ...store.accessor import Accessor
 from ...store.catalog import Outline, outline
@@ -28,6 +28,7 @@ from ..partfile import PartFile, there_already
 from .listing import as_data
 from .options import DEFAULT_URL, Force, Namespace, Output, PathArgument, Publish, Text, Url, Value, with_server
 from .output import clean, counted, emit, is_terminal, json_text, note, size_text, typed, width
+from .raw import raw_at
 from .running import NOTHING, USAGE, CommandFailed, guarded, run
 
 _MOST_FOR_PREVIEW = 256_000_000
@@ -51,7 +52,8 @@ def get(
     """Print a value, or write it to a file.
 
     Plain values are printed as JSON. An array is shown as its type and range with its first and last
-    numbers; inside a dict, arrays are named and not fetched.
+    numbers; inside a dict, arrays are named and not fetched. Keys of programs without REEM are printed as the
+    JSON, text or bytes that they hold.
 
     Exit code 3 if nothing is there.
 
@@ -72,13 +74,16 @@ def get(
         # First what it is, without arrays: then what is too large to be shown is not fetched.
         try:
             node = await outline(interface, store.at(path).full_path)
-        except MissingKey as missing:
-            item = await _item(interface, store.at(path).full_path, missing)
+        except (MissingKey, WrongKind, BadKey) as missing:
+            item = await _item(interface, path, missing)
             if output is not None:
                 note(save(item, output, path, replace=force))
+            elif as_json:
+                emit(json_text(item))
+            elif isinstance(item, np.ndarray | bytes):
+                emit(preview(item, width() if is_terminal() else 100))
             else:
-                shown = isinstance(item, np.ndarray) and not as_json
-                emit(preview(item, width() if is_terminal() else 100) if shown else json_text(item))
+                emit(_text(item) if raw and isinstance(item, str) else json_text(item, pretty=True))
             return
         if output is not None:
             note(save(await store.get(path), output, path, replace=force))
@@ -91,8 +96,13 @@ def get(
     run("get", work, url, namespace)
 
 
-async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -> Any:
-    """Return the item of an array that a path leads into; raises `missing` if it leads into none."""
+async def _item(interface: RedisInterface, text: str, missing: ReemError) -> Any:
+    """Return what a path leads to in an array, or in a key of another program; raises `missing` if in none."""
+    if (raw := await raw_at(interface, text)) is not None:
+        return fetched(text, raw[1], LARGEST)
+    if not isinstance(missing, MissingKey):
+        raise missing
+    path = parse(text)
     for end in range(len(path) - 1, 0, -1):
         if not isinstance(path[end], int):
             break
@@ -107,11 +117,14 @@ async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -
     raise missing
 
 
+def _text(text: str) -> str:
+    return "\n".join(map(clean, text.split("\n"))) if is_terminal() else text
+
+
 async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:
     # For scripts: the text as it is, without quotes. A terminal is not sent what it would obey.
     if raw and node.kind == "str":
-        text = str(node.value)
-        return "\n".join(map(clean, text.split("\n"))) if is_terminal() else text
+        return _text(str(node.value))
     if node.plain or node.kind in ("dict", "list"):
         return json_text(as_data(node), pretty=True)
     if node.size > _MOST_FOR_PREVIEW:

@@ -22,6 +22,7 @@ from ...plan import Plan, Reply, wire_commands
 from ...plan.keys import Keys
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
+from ...plan.raw import kinds_of
 from ...plan.reads import HeldValues, RawRead, read
 from ...plan.replies import decoded
 from ...plan.trees import MISSING, mapped
@@ -392,8 +393,11 @@ class RecordedKeys:
 
     async def present(self) -> set[str]:
         """Return the keys there are, of those that are recorded; those that are recorded by name always."""
-        globs = {top for top in self.tops if "*" in top or "?" in top}
-        return {*self.tops} - globs | await present_keys(self._collector.session, globs)
+        session, globs = self._collector.session, {top for top in self.tops if "*" in top or "?" in top}
+        # Those of other programs are recorded in another way (raw_keys.py), unless there is a namespace.
+        named = {*self.tops} - globs
+        others = await session.run(kinds_of(list(named))) if named and not session.namespace else {}
+        return (named - others.keys()) | await present_keys(session, globs)
 
     def changed(self, key: str | None) -> None:
         if key is None:

@@ -31,6 +31,7 @@ from ...session import Session
 from .format import RecordingFailed
 from .key_recorder import RecordedKeys
 from .output import FileGone
+from .raw_keys import RawRecorder
 from .sample import Sample, Sampler, samples_of
 from .sink import Sink
 from .times import PATIENCE, Arrivals, Clock
@@ -88,7 +89,8 @@ class Recorder:
     and counts.
 
     What is only stored, by any client, is recorded a moment later (`LogUpdate.kind` is "stored"): several changes in a
-    moment are one. Where the user may not use CLIENT TRACKING, it is read at the keyframes, and a warning says so.
+    moment are one. So are keys of programs without REEM, as JSON, text or bytes, up to 64 MB; with a namespace, none.
+    Where the user may not use CLIENT TRACKING, it is read at the keyframes, and a warning says so.
 
     The file can be read while it grows, and after the recorder was killed but for the last second. It
     is not synchronised to the disk: a power cut costs what the system had not written yet.
@@ -145,6 +147,7 @@ class Recorder:
             self._monitor.invalidated = lambda name: self._keys.of(name).lost(None)
             self._monitor.resynchronised = self._keys.lost
             self._monitor.changed = self._keys.changed
+        self._raw = RawRecorder(self, tops)
         self._sampler = Sampler(
             self.session, self._samples, lambda path, *read: self._keys.of(str(path[0])).sampled(path, *read)
         )
@@ -174,7 +177,10 @@ class Recorder:
                 self._begin(self._listen)
                 for name in await self._keys.present():
                     self._keys.of(name).read()
+                await self._raw.start()
+                self._begin(self._raw.follow)
                 await self._keys.settled(_PATIENCE)
+                await self._raw.settled(_PATIENCE)
                 self._begin(lambda: find_regularly(self._search))
             self._sampler.start()
             self._begin(self._tick)
@@ -206,6 +212,7 @@ class Recorder:
                 await self.fence()
             self._pump()
             await self._keys.settled(_PATIENCE)
+            await self._raw.settled(_PATIENCE)
             await self._look_once_more()
             await self._complete(time.monotonic() + _PATIENCE)
             self._keyframe_of_all()
@@ -221,6 +228,7 @@ class Recorder:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self._keys.cancel()
         with contextlib.suppress(InterfaceClosed):
+            await self._raw.stop()
             if self._monitor is not None:
                 await self._monitor.close()
         ended = {"ended": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "seconds": f"{self.status.seconds:.3f}"}
@@ -350,7 +358,7 @@ class Recorder:
         if self._connected and self.writer_thread.waiting < (1 << 20):
             for name in list(self.writer_thread.behind):
                 self.writer_thread.behind.discard(name)
-                if self._keys.concerns(name):
+                if name not in self._raw.names and self._keys.concerns(name):
                     self._keys.of(name).read()
 
     def look_for_losses(self) -> None:
@@ -380,6 +388,7 @@ class Recorder:
     def _keyframe_of_all(self) -> None:
         self._keyframes += 1
         self._keys.keyframe(self._keyframes)
+        self._raw.keyframe(self._keyframes)
 
 
 def description(

@@ -98,6 +98,8 @@ export class Tree {
     else row.removeAttribute("aria-expanded");
     setNumbers(parts.value, container ? node.text || `${node.count} ${node.kind === "dict" ? (node.count === 1 ? "key" : "keys") : node.count === 1 ? "item" : "items"}` : node.text);
     parts.value.className = `value is-${node.text.startsWith("[") && container ? "float" : node.kind.replace(/\W/g, "")}`;
+    row.classList.toggle("raw", Boolean(node.raw) && this.root === "" && level === 1);
+    parts.key.title = node.raw ? `${node.label}: another program's ${node.raw}` : node.label;
     parts.value.title = `${nameOf(node.kind)}  ${node.text}`;
     setText(parts.size, container || PLAIN.includes(node.kind) ? "" : bytesText(node.size));
     parts.spark.show(node, this.app.now());

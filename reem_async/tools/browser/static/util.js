@@ -90,11 +90,11 @@ export async function getPicture(what, values, signal) {
   return { blob: await bodyOf(response, "blob"), said: said ? JSON.parse(said) : null };
 }
 
-export async function postWrite(path, valueText, key) {
+export async function postWrite(path, valueText, key, to = "write") {
   // The text goes as it is: numbers beyond 2^53 would change in JavaScript.
   const body = `{"path":${JSON.stringify(path)},"value":${valueText}}`;
   const headers = { "content-type": "application/json", "x-reem-key": key };
-  return fetched("/api/write", { method: "POST", headers, body });
+  return fetched(`/api/${to}`, { method: "POST", headers, body });
 }
 
 export function setText(it, text) {

@@ -112,6 +112,7 @@ export class View {
     const size = node.kind === "dict" || node.kind === "list" ? `${node.count} ${node.count === 1 ? "item" : "items"}` : bytesText(node.size);
     const age = node.time === null ? "" : ageText(Math.max(this.app.now() - node.time, 0));
     const words = [nameOf(node.kind), node.kind === "numpy" ? node.text : "", SCALARS.includes(node.kind) && node.kind !== "str" ? "" : size];
+    if (node.raw) words.push(`another program's ${node.raw}`);
     if (node.rate >= 2) words.push(`${Math.round(node.rate)} Hz`);
     if (age) words.push(age === "now" ? "changed now" : `changed ${age} ago`);
     setText(this.what, words.filter(Boolean).join(" · "));
@@ -350,7 +351,22 @@ class BytesBody {
     this.picture = el("div", { class: "picture", hidden: true }, this.image);
     this.dump = el("pre", { class: "bytes" });
     this.hex = el("details", { class: "card", open: true }, el("summary", {}, "Bytes"), this.dump);
-    parent.append(this.picture, this.hex);
+    this.wrong = el("p", { class: "wrong", role: "alert", hidden: true });
+    const hint = el("input", { type: "text", size: 24, "aria-label": "What these bytes are", placeholder: "uint8[480,640,3]", title: "Type and shape, then +N for an offset in bytes: float32[7]+8" });
+    this.hint = el("form", { class: "tools hint-form", hidden: true, onsubmit: (event) => { event.preventDefault(); this.say(hint.value); } }, el("label", {}, "Show as ", hint), el("button", { type: "submit" }, "Show"));
+    parent.append(this.picture, this.hint, this.wrong, this.hex);
+  }
+
+  // What packed bytes are, the page cannot know: it is said once, and holds for all pages of this program.
+  async say(text) {
+    try {
+      await postWrite(this.address, JSON.stringify(text), this.app.config.key, "hint");
+      this.wrong.hidden = true;
+      this.app.refresh();
+    } catch (error) {
+      setText(this.wrong, error.message);
+      this.wrong.hidden = false;
+    }
   }
 
   async update(node, signal) {
@@ -359,6 +375,7 @@ class BytesBody {
     setText(this.dump, said.rows.map(([at, hex, text]) => `${at}  ${hex.padEnd(47)}  ${text}`).join("\n") + (said.bytes > 1024 ? "\n…" : ""));
     if (this.picture.hidden === said.picture) this.hex.open = !said.picture;
     this.picture.hidden = !said.picture;
+    this.hint.hidden = said.picture || !this.app.config.live || !node.raw;
     if (!said.picture) return;
     const { blob } = await getPicture("picture", values, signal);
     await swap(this.image, blob);
