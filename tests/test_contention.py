@@ -116,6 +116,16 @@ def test_nobody_is_faster_than_the_server_calculates(server, raw, monkeypatch, n
                     getattr(front, method)(["robot", "n"], 3)
 
 
+def test_a_refused_call_leaves_nothing_watched(server):
+    with reem.RedisInterface(server.url) as one, reem.RedisInterface(server.url) as other:
+        mine, others = reem.KeyValueStore(one), reem.KeyValueStore(other)
+        mine["a"] = {"items": [np.zeros(2)]}
+        with pytest.raises(reem.PathRefused):
+            mine["a"]["items"][-5] = 1
+        others["a"]["n"] = 1
+        mine["b"] = {"image": np.zeros(2)}  # a transaction over the same connection
+
+
 def test_there_are_two_attempts_however_long_they_take():
     commands = [("UNLINK", "{robot}.image"), ("JSON.SET", "robot", "$", b"1")]
     contention = Contention(1e-6)
