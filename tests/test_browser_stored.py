@@ -8,7 +8,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import LOOKING, PLAIN, RawCluster, aeventually, commands_run, same_bits, server_without_right, subscribed
+from conftest import (
+    LOOKING,
+    PLAIN,
+    RawCluster,
+    aeventually,
+    commands_run,
+    same_bits,
+    server_without_right,
+    sized,
+    subscribed,
+)
 
 import reem_async
 from reem_async.errors import ConnectionLost
@@ -133,7 +143,7 @@ async def test_an_array_that_is_stored_right_behind_a_published_one_is_seen(
 ):
     await apspace[key()].write({"x": 1, "array": np.zeros(size)})
     async with past_of(server_url, key()) as source:
-        for number in range(1, 16):
+        for number in range(1, sized(8, 16)):
             await apspace[key()]["array"].write(np.full(size, number))
             await akvs[key()]["array"].write(np.full(size, -number))
             await seen(source, np.full(size, -number), key(), "array")

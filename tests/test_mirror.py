@@ -373,7 +373,7 @@ def asked(mirror):
         return None
 
 
-@pytest.mark.parametrize("seed", range(sized(2, 10)))
+@pytest.mark.parametrize("seed", range(sized(1, 10)))
 async def test_no_age_is_smaller_than_the_true_one(seed):
     """Whatever comes between; and answers come where nothing does."""
     over = threading.Event()

@@ -99,7 +99,7 @@ JSON = st.recursive(
 FIELDS = st.sampled_from(["type", "default", "low", "high", "unit", "help", "choices"])
 
 
-@settings(max_examples=sized(300, 3000), deadline=None)
+@settings(max_examples=sized(150, 3000), deadline=None)
 @given(JSON | st.dictionaries(FIELDS, JSON | st.sampled_from(["int", "float[2]", "str"])))
 def test_what_another_program_has_stored_is_a_specification_or_bad_data(data):
     try:
