@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import assert_same, sized
 
-from reem_async.errors import BadInput, BadType, BadValue, MissingKey
+from reem_async.errors import BadData, BadInput, BadType, BadValue, MissingKey
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import Ships, default_ships
 from reem_async.tools.recording import open_log
@@ -17,16 +17,21 @@ BEGUN = 1_764_000_000
 """Seconds since 1970 at which the recordings of these tests begin."""
 
 
-def recorded(file, changes):
-    """Write a recording of changes: seconds since BEGUN, full path and value, MISSING for a deletion."""
+def recorded(file, changes, arrived=None):
+    """Write a recording of changes: seconds since BEGUN, full path and value, MISSING for a deletion.
+
+    The seconds are when they were published, and when they were received too, unless `arrived` says when that was.
+    """
     sink = Sink(file, "none", {}, overwrite=False)
     sink.output.appear()
     thread = WriterThread(sink, Ships(default_ships(), CommandRecorder), 1 << 30)
     thread.start()
-    for number, (at, path, value) in enumerate(sorted(changes, key=lambda change: change[0]), 1):
+    when = arrived or float
+    for number, (at, path, value) in enumerate(sorted(changes, key=lambda change: (when(change[0]), change[0])), 1):
         role = Role.DELETE if value is MISSING else Role.UPDATE
-        stamp = BEGUN * 10**9 + round(at * 1e6) * 1000
-        thread.put(Operation(role, path, value, (stamp, stamp, number)), 0)
+        received, published = (BEGUN * 10**9 + round(it * 1e6) * 1000 for it in (when(at), at))
+        received += number * 2000 if arrived else 0  # no two have the same
+        thread.put(Operation(role, path, value, (received, published, number)), 0)
     thread.stop({})
     assert thread.failure is None
     return open_log(file)
@@ -121,6 +126,7 @@ def test_arrays_are_stacked_in_bounded_blocks_and_missing_rows_are_marked(file, 
         ({"rate": 10, "method": {"b": "linear"}}, BadValue, "none of the paths: a, t"),
         ({"rate": 10, "tolerance": -1}, BadValue, "tolerance=-1 is out of range"),
         ({"rate": 10, "method": "linear"}, BadType, r"t is 'text' at .* use the method previous or nearest"),
+        ({"rate": 10, "clock": "server"}, BadValue, "clock='server' is none of recorder, publisher"),
         ({"rate": 10, "start": "now"}, BadInput, "seconds since 1970"),
     ],
 )
@@ -136,6 +142,15 @@ def test_numbers_that_change_their_shape_are_not_interpolated(file):
     changes = [(0, ("a",), [1.0]), (1, ("a",), [1.0, 2.0])]
     with recorded(file, changes) as log, pytest.raises(BadType, match=r"a changes from \(1,\) to \(2,\) numbers"):
         log.align(["a"], rate=10, method="linear").read()
+
+
+def test_a_publisher_whose_clock_was_set_back_is_reported(file):
+    """By over a second; two publishers of one path may be received in another order than by their times."""
+    received = {100: 100, 100.5: 101, 100.2: 102, 5: 103, 6: 104}
+    with recorded(file, [(at, ("a",), at) for at in received], arrived=received.get) as log:
+        assert log.align(["a"], on="a").read()["a"].tolist() == list(received)
+        with pytest.raises(BadData, match=r'publisher of a was set back by 95.500 s.*use the clock "recorder"'):
+            log.align(["a"], rate=10, start=BEGUN + 100, end=BEGUN + 200, clock="publisher").read()
 
 
 def test_an_episode_is_a_span_in_which_a_path_holds_a_dict(file):

@@ -1,6 +1,7 @@
 """Training sets: what is read back is what was published, nearest in time, and what is missing is counted."""
 
 import json
+import math
 import sys
 
 import numpy as np
@@ -87,6 +88,24 @@ def test_five_episodes_are_read_back_as_they_were_published(five, tmp_path):
     assert [row["frame"] for row in rows if row["episode"] == 1] == list(range(sum(it["episode"] == 1 for it in rows)))
     tasks = {(row["episode"], row["task"]) for row in rows}
     assert tasks == {(place, f"task {number % 2}") for place, number in enumerate((0, 1, 3, 4, 5))}
+
+
+def test_the_publishers_times_count_where_the_recorder_was_late(file, tmp_path):
+    """It had no processor for 0.4 s at a time: by its own times, frames are missing."""
+    changes = published(3, (0, {"task": "t"}), (2.9, None))
+    recorded(file, changes, arrived=lambda at: math.floor(at / 0.4 + 1) * 0.4).close()
+    for clock in ("recorder", "publisher"):
+        run = invoked("log", "export", file, "-o", tmp_path / f"{clock}.parquet", *OPTIONS, "--clock", clock, "--json")
+        assert run.returncode == 0, run.stderr
+        (episode,) = json.loads(run.stdout)["episodes"]
+        assert (episode["missing"] == 0) == (clock == "publisher")
+    rows = parquet.read_table(tmp_path / "publisher.parquet").to_pylist()
+    assert len(rows) == pytest.approx(2.9 * 30, abs=1)
+    for row in rows:
+        at, _, found = nearest(changes, ("arm",), row["time"] - BEGUN)
+        assert (row["arm.q"], abs(at - row["time"] + BEGUN) <= 0.5 / 30) == (found["q"], True)
+        at, _, found = nearest(changes, ("cam", "rgb"), row["time"] - BEGUN)
+        assert (row["cam.rgb"]["bytes"], abs(at - row["time"] + BEGUN) <= 0.5 / 30) == (found.data, True)
 
 
 def test_pandas_and_datasets_open_it(five, tmp_path):

@@ -83,6 +83,14 @@ def export(
             help="How far a value may be away from its frame; 3/4 of a frame if not given.",
         ),
     ] = None,
+    clock: Annotated[
+        str,
+        typer.Option(
+            metavar="CLOCK",
+            rich_help_panel=_TRAINING,
+            help="Whose times count: recorder, or publisher, where all publishers have clocks that agree.",
+        ),
+    ] = "recorder",
     max_missing: Annotated[
         float | None,
         typer.Option(
@@ -129,6 +137,7 @@ def export(
                 episodes=episodes,
                 method=_by_path("--method", method, "nearest"),
                 tolerance=_by_path("--tolerance", tolerance, None),
+                clock=clock,
                 max_missing=max_missing,
                 progress=bar("exporting"),
             )

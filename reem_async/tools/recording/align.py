@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import BadType, BadValue
+from ...errors import BadData, BadType, BadValue
 from ...plan.arguments import check_number
 from ...plan.paths import Path, shorten, show
 from ...plan.trees import MISSING
@@ -89,9 +89,11 @@ class Alignment:
         instants: Callable[[], Iterator[int]],
         start: int,
         *,
+        clock: str,
         method: str | Mapping[str, str],
         tolerance: float | Mapping[str, float] | None,
     ) -> None:
+        self._clock = clock
         self._past = past
         self._whole = whole
         self._places = places
@@ -127,8 +129,11 @@ class Alignment:
             yield seconds(instant), {path: value for path, value in found.items() if value is not MISSING}
 
     def _cursors(self) -> dict[str, _Cursor]:
+        start = self._start
         return {
-            path: _Cursor(self._past, self._whole, place, self._methods[path], self._tolerances[path], self._start)
+            path: _Cursor(
+                self._past, self._whole, place, self._clock, self._methods[path], self._tolerances[path], start
+            )
             for path, place in self._places.items()
         }
 
@@ -152,6 +157,9 @@ class Alignment:
 
 
 _NO_LIMIT = 2**63
+CLOCKS = ("recorder", "publisher")
+_SET_BACK = 10**9
+"""Nanoseconds; two publishers of one path may be received in another order than by their times, within moments."""
 
 Whole = Callable[[Any], Any]
 """Returns a tree with its arrays; MISSING if something in it cannot be read."""
@@ -189,6 +197,22 @@ def _filled(column: list[Any], missing: np.ndarray[Any, Any]) -> np.ndarray[Any,
     return full
 
 
+def by_clock(
+    past: RecordedPast, path: Path, clock: str, changes: Iterator[tuple[int, Any]]
+) -> Iterator[tuple[int, Any]]:
+    """Yield changes with the times of a clock, which never go back; raise BadData if a publisher's was set back."""
+    last = 0
+    for received, tree in changes:
+        time = received if clock == "recorder" else past.published_at(path, received)
+        if time < last - _SET_BACK:
+            raise BadData(
+                f"the clock of the publisher of {show(path)} was set back by {seconds(last - time):.3f} s, in what was "
+                f'received at {seconds(received)!r}; use the clock "recorder"'
+            )
+        last = max(time, last)
+        yield last, tree
+
+
 class _TimedValue:
     """What was at a path from an instant on, in ns."""
 
@@ -204,7 +228,9 @@ class _TimedValue:
 class _Cursor:
     """The values of one path before and after an instant that only moves on."""
 
-    def __init__(self, past: RecordedPast, whole: Whole, path: Path, method: str, tolerance: int, start: int) -> None:
+    def __init__(
+        self, past: RecordedPast, whole: Whole, path: Path, clock: str, method: str, tolerance: int, start: int
+    ) -> None:
         self.counts = AlignedCounts()
         self._whole = whole
         self._path = path
@@ -213,7 +239,8 @@ class _Cursor:
         self._start = start
         newest = past.newest(past.concerning(path), start, -1)
         # From the last value before the start on, if there is one.
-        self._changes = past.changes(path, (start if newest is None else newest[0].time) - 1)
+        changes = past.changes(path, (start if newest is None else newest[0].time) - 1)
+        self._times = by_clock(past, path, clock, changes)
         self._before: _TimedValue | None = None
         self._after = self._next()
 
@@ -234,7 +261,7 @@ class _Cursor:
         return value
 
     def _next(self) -> _TimedValue | None:
-        change = next(self._changes, None)
+        change = next(self._times, None)
         return None if change is None else _TimedValue(*change)
 
     def _near(self, each: _TimedValue | None, instant: int) -> bool:

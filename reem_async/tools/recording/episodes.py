@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ...plan.paths import Path
@@ -42,23 +43,24 @@ class Episode:
         return self.data.get("discard") is True or self.data.get("outcome") == "discarded"
 
 
-def episodes_of(past: RecordedPast, whole: Whole, path: Path, end: float) -> list[Episode]:
+def episodes_of(past: RecordedPast, whole: Whole, path: Path, clock: str, end: float) -> list[Episode]:
     """Return the episodes that the dicts at a path make, in order; see `Log.episodes`."""
     above = [it for it in past.concerning(path) if len(it.path) <= len(path)]
     wholes = {int(time) for time in past.timeline.times([channel for it in above for channel in it.channels])}
     found: list[Episode] = []
     begun, data = 0, None
+    shown = partial(past.published_at, path) if clock == "publisher" else int
     for ns, tree in past.changes(path, -1):
         value = whole(tree)
         value = value if isinstance(value, dict) else None
         if data is not None and (value is None or (ns in wholes and not _continues(data, value))):
-            found.append(Episode(seconds(begun), seconds(ns), data, ended=True))
+            found.append(Episode(seconds(shown(begun)), seconds(shown(ns)), data, ended=True))
             data = None
         if value is not None:
             begun = begun if data is not None else ns
             data = value
     if data is not None:
-        found.append(Episode(seconds(begun), end, data, ended=False))
+        found.append(Episode(seconds(shown(begun)), end, data, ended=False))
     return found
 
 

@@ -19,7 +19,7 @@ from ...plan.trees import MISSING
 from ...ships.base import SpecialDatatypeShip
 from ...ships.registry import Ships, default_ships
 from ...transport.protocol import CommandRecorder
-from .align import Alignment, at_rate, stacked
+from .align import CLOCKS, Alignment, at_rate, by_clock, stacked
 from .container import Container, Ref, Totals
 from .episodes import Episode, episodes_of
 from .format import NEWS, Role
@@ -384,10 +384,9 @@ class Log:
         tolerance: float | Mapping[str, float] | None = None,
         start: Instant | None = None,
         end: Instant | None = None,
+        clock: str = "recorder",
     ) -> Alignment:
         """Return the values of several paths at common instants: a loop over it yields blocks of rows.
-
-        Times are those at which the recorder received the updates, on its clock.
 
         Args:
             paths: The paths, such as ["arm.q", "cam.rgb"].
@@ -400,9 +399,13 @@ class Log:
                 without one has no value. No limit if not given.
             start: The first instant; the beginning of the recording if not given.
             end: The last instant; the end of the recording if not given.
+            clock: Whose times count. "recorder": when it received the updates. "publisher": when they were published,
+                which is more exact where all publishers run on one host, or have clocks that agree. What was only
+                stored has the recorder's time.
 
         Raises:
             BadType, BadValue: An argument that means nothing, or "linear" for what is no number.
+            BadData: In a loop: the clock of a publisher was set back, by over a second.
             MissingKey: Nothing was recorded at a path.
         """
         if isinstance(paths, str) or not paths:
@@ -411,17 +414,21 @@ class Log:
             raise BadValue('give either rate, in rows per second, or on, a path such as "cam.rgb"')
         if rate is not None:
             check_number("rate", rate, "use rows per second, over 0", above=0, most=1e6)
+        if clock not in CLOCKS:
+            raise BadValue(f"clock={shorten(clock)} is none of {', '.join(CLOCKS)}")
         places = {path: self._known(path) for path in paths}
         first, last = nanoseconds(self.start if start is None else start), nanoseconds(self.end if end is None else end)
         if rate is not None:
             instants = partial(at_rate, rate, first, last)
         else:
-            instants = partial(self._instants, self._known(on or ""), first, last)
-        return Alignment(self._past, self._whole, places, instants, first, method=method, tolerance=tolerance)
+            instants = partial(self._instants, self._known(on or ""), clock, first, last)
+        return Alignment(
+            self._past, self._whole, places, instants, first, clock=clock, method=method, tolerance=tolerance
+        )
 
-    def _instants(self, path: Path, start: int, end: int) -> Iterator[int]:
+    def _instants(self, path: Path, clock: str, start: int, end: int) -> Iterator[int]:
         """Yield when there was an update of a path, in ns."""
-        for ns, tree in self._past.changes(path, start - 1, end):
+        for ns, tree in by_clock(self._past, path, clock, self._past.changes(path, start - 1, end)):
             if tree is not MISSING:
                 yield ns
 
@@ -433,14 +440,14 @@ class Log:
             raise MissingKey(f"nothing was recorded at {shorten(text)}; the recording has {there}")
         return path
 
-    def episodes(self, path: str = "episode") -> list[Episode]:
+    def episodes(self, path: str = "episode", *, clock: str = "recorder") -> list[Episode]:
         """Return the spans in which a path held a dict, in order; none if it never did.
 
         An episode begins when a dict is written there, and ends when the dict is deleted, when something else is
         written, such as None, or another whole dict. A whole dict that only adds fields, or changes `outcome` or
-        `discard`, belongs to the running episode, and so does every change of a field.
+        `discard`, belongs to the running episode, and so does every change of a field. `clock` is that of `align`.
         """
-        return episodes_of(self._past, self._whole, self[path].path, self.end)
+        return episodes_of(self._past, self._whole, self[path].path, clock, self.end)
 
     def channels(self, progress: Callable[[int, int], None] | None = None) -> list[ChannelSummary]:
         """Return what each channel of the file holds, by topic.

@@ -277,6 +277,12 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             if not repeats:
                 yield ns, tree
 
+    def published_at(self, path: Path, ns: int) -> int:
+        """Return when the news on a path of an instant was published (ns), or that instant if it was not."""
+        streams = [it for it in self.concerning(path) if it.kind == Kind.PUBLISHED]
+        newest = self.newest(streams, ns, ns - 1)
+        return ns if newest is None else self.stamp(newest[0])[0] or ns
+
     def missed(self, ref: Ref) -> int | None:
         """Return how many updates were lost in a gap, None if their publisher's numbers did not tell."""
         message, missed = self._container.message(ref), None

@@ -95,6 +95,7 @@ class TrainingSet:
         episodes: The path whose dicts are the episodes. If it never held one, all of the recording is one episode.
         method: See `Log.align`.
         tolerance: Seconds likewise; three quarters of a frame if not given.
+        clock: Whose times count, as in `Log.align`.
         max_missing: The share of frames that may be missing in an episode; any if not given.
         progress: Called with the frames done and all of them.
 
@@ -120,6 +121,7 @@ class TrainingSet:
         episodes: str = "episode",
         method: str | Mapping[str, str] = "nearest",
         tolerance: float | Mapping[str, float] | None = None,
+        clock: str = "recorder",
         max_missing: float | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
@@ -139,6 +141,7 @@ class TrainingSet:
         self._options: dict[str, Any] = {
             "rate": rate,
             "method": method,
+            "clock": clock,
             "tolerance": near if tolerance is None else tolerance,
         }
         if isinstance(tolerance, Mapping):
@@ -146,7 +149,7 @@ class TrainingSet:
         self.log = log.raw
         self._max_missing = max_missing
         self._progress = progress or (lambda done, total: None)
-        found = log.episodes(episodes)
+        found = log.episodes(episodes, clock=clock)
         self.has_episodes = bool(found)
         self.episodes = [it for it in found if not it.discarded]
         self.discarded = len(found) - len(self.episodes)
@@ -193,9 +196,11 @@ class TrainingSet:
 
     def _begin(self, episode: Episode) -> float:
         """Return the instant of the first frame: in step with the first picture, so that each has one of its own."""
-        for path in self.images[:1]:
-            for time, _ in self.log[path].values(episode.start, episode.end):
-                return time - math.floor((time - episode.start) * self.rate) / self.rate
+        if self.images:
+            options = {"start": episode.start, "end": episode.end, "clock": self._options["clock"]}
+            for time, _ in self.log.align(self.images[:1], on=self.images[0], **options).rows():
+                if time >= episode.start:
+                    return time - math.floor((time - episode.start) * self.rate) / self.rate
         return episode.start
 
     def _check(self, report: ExportedEpisode) -> None:
