@@ -117,6 +117,11 @@ class RawWatch(Stream[RawUpdate]):
     def _following(self) -> bool:
         return self.is_begun or self._closed
 
+    def limit_rate(self, rate: float) -> None:
+        """Have at most so many bytes a second read of each key from now on, once it has begun."""
+        if self._follower is not None:
+            self._follower.rate = rate
+
     async def caught_up(self, seconds: float) -> None:
         """Return when what was changed before now is read and taken, or so many seconds are over."""
         follower = self._follower
@@ -198,7 +203,7 @@ class _Follower:
     ) -> None:
         self.queue = queue
         self._session, self._globs, self._name = session, globs, name
-        self._largest, self._pace, self._rate = largest, pace, rate
+        self._largest, self._pace, self.rate = largest, pace, rate
         self._is_waiting = lazy  # for the first key
         self._wires: dict[Transport, Wire] = {}
         self._news = asyncio.Event()
@@ -387,7 +392,7 @@ class _Follower:
         elif was_known or len(self._known) < _MOST_KNOWN:
             self._known[name] = None
         if it.size >= _SLOW:
-            self._rests[name] = asyncio.get_running_loop().time() + it.size / self._rate
+            self._rests[name] = asyncio.get_running_loop().time() + it.size / self.rate
         gap = is_first is False
         update = RawUpdate(
             name,

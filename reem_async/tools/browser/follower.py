@@ -36,7 +36,7 @@ from .trees import framed, is_kept, same, weight
 _WAITING = 50_000  # updates that wait for this program before the oldest are skipped
 # The part of BACKGROUND_RATE at which arrays are read for the slider while no page is open: one picture a second.
 # With a page it is four a second each of two cameras.
-_UNSEEN = 1 / 8
+UNSEEN = 1 / 8
 _RECENT = 16  # updates that are known again if they come twice, where there may be thousands of keys
 
 # Documents that are asked for at the same time.
@@ -276,7 +276,7 @@ class Follower:
         self.history = history
         # Bytes of long documents that may be kept
         self.texts = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
-        self.arrays = Allowance(BACKGROUND_RATE * _UNSEEN, history.budget / 2)  # bytes of arrays that may be read
+        self.arrays = Allowance(BACKGROUND_RATE * UNSEEN, history.budget / 2)  # bytes of arrays that may be read
         self.monitor = Monitor(interface, policy=Last(_WAITING), raw=True)
         self.monitor.invalidated = lambda name: self.key(name).doubt()
         self.monitor.broken, self.monitor.changed = self._lost, self._changed
@@ -313,7 +313,7 @@ class Follower:
         await self.monitor.close()
 
     def shown_on(self, pages: int) -> None:
-        self.arrays.rate = BACKGROUND_RATE * (1 if pages else _UNSEEN)
+        self.arrays.rate = BACKGROUND_RATE * (1 if pages else UNSEEN)
 
     @property
     def hears_of_changes(self) -> bool:

@@ -86,6 +86,7 @@ class LiveSource:
 
     def shown_on(self, pages: int) -> None:
         self._follower.shown_on(pages)
+        self._raw.shown_on(pages)
 
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
         return snippets(path, self.interface.session.options.url, self.interface.namespace, raw=self._is_raw(path))

@@ -21,6 +21,7 @@ from ...plan.trees import MISSING, get, walk
 from ...pubsub.raw_watch import RawUpdate, RawWatch
 from ...pubsub.refresh import BACKGROUND_RATE
 from ...session import Session
+from .follower import UNSEEN
 from .history import History
 from .trees import Frame, framed, thawed
 
@@ -91,7 +92,11 @@ class RawFollower:
         except NotAllowed as error:
             self.refused = f"keys of programs without REEM are not shown: {error}"
         else:
+            self.shown_on(0)
             self._task = asyncio.create_task(self._follow())
+
+    def shown_on(self, pages: int) -> None:
+        self._watch.limit_rate(BACKGROUND_RATE * (1 if pages else UNSEEN))
 
     async def close(self) -> None:
         if self._task is not None:
