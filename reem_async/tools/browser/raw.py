@@ -26,7 +26,7 @@ from .history import History
 from .trees import Frame, framed, thawed
 
 _WAITING = 50_000  # updates that wait for this program before the oldest are skipped
-_PACE = 0.05  # seconds between two readings: the page draws ten times a second
+_PACE = 0.1  # seconds between two readings: the page draws ten times a second
 _RATE_SECONDS = 5.0  # over which changes are counted
 _READINGS = int(_RATE_SECONDS / _PACE)
 _LARGEST = 16 << 20  # bytes of a key that are fetched

@@ -50,7 +50,7 @@ def echo(
     the time at which they were found; several in a moment may share one line. Of an update of a whole dict, the part
     at the given path is printed. Values over 16 KB do not travel with the notice: size, type and shape are printed.
     Changes of keys of programs without REEM are marked with their Redis type, such as (raw hash). They are read up to
-    20 times a second, and up to 64 KB. Lines that begin with # report lost and skipped updates; in JSON they are
+    4 times a second, and up to 64 KB. Lines that begin with # report lost and skipped updates; in JSON they are
     "missed", "gap" and "skipped". A terminal cuts long lines, a pipe does not.
 
     Examples:

@@ -25,7 +25,7 @@ from .running import TIMED_OUT
 _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""
 
-_PACE = 0.05  # seconds between two readings of such keys: people read no faster
+_PACE = 0.25  # seconds between two readings of such keys: each may keep a writer waiting for a moment
 
 _NEVER = float("inf")
 

@@ -26,7 +26,7 @@ from .writer_thread import Operation, WriterThread
 logger = logging.getLogger("reem.recording")
 
 _WAITING = 10_000  # updates that wait for the recorder before the oldest are skipped
-_PACE = 0.01  # seconds between two readings
+_PACE = 0.02  # seconds between two readings
 _RATE = 32 << 20  # bytes a second that are read of each key: each picture of a camera of 0.9 MB at 30 Hz
 
 
