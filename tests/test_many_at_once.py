@@ -55,6 +55,16 @@ async def test_a_caller_that_is_cancelled_while_it_waits_leaves_no_place_taken(a
     assert await accessor["n"].read() == 100
 
 
+async def test_a_call_that_is_cancelled_while_it_connects_leaves_the_connection_to_others(server_url, key):
+    interface = reem_async.RedisInterface(server_url)
+    accessor = reem_async.KeyValueStore(interface)[key()]
+    first, second = [asyncio.create_task(accessor.read()) for _ in range(2)]
+    await asyncio.sleep(0)
+    first.cancel()
+    assert await second is None
+    await interface.close()
+
+
 async def test_calls_made_in_a_turn_that_takes_longer_than_the_limit_are_answered(server_url, key):
     """The limit counts from when they are sent, and not while the loop is busy."""
     async with reem_async.RedisInterface(server_url, timeout=0.1) as interface:

@@ -188,6 +188,32 @@ async def test_what_is_changed_right_behind_the_touch_is_not_in_what_is_read(key
         looks.cancel()
 
 
+async def test_an_array_that_was_read_before_is_not_joined_with_a_newer_document(key, akvs, binterface, file):
+    """The report of its change may come as late as the answer to a fence."""
+    await akvs[key()].write({"n": 1, "image": np.full(100, 1.0)})
+    async with recording(binterface, [key()], file) as recorder:
+        await aeventually(lambda: is_followed(recorder, key()))
+        monitor, reader, late = recorder._monitor, recorder._keys.of(key())._reader, []
+        changed, fence = monitor.changed, reader._fence
+
+        def hold(name):
+            if name == binterface.session.keys(key()).document:
+                changed(name)
+            else:
+                late.append(name)
+
+        async def deliver():
+            while late:
+                changed(late.pop())
+            await fence()
+
+        monitor.changed, reader._fence = hold, deliver
+        await akvs[key()].write({"n": 2, "image": np.full(100, 2.0)})
+        await recorder.written(key())
+        monitor.changed = changed
+    assert [(place, kind) for place, kind, _ in news(file)] == [(key(), "kvs"), (key(), "stored")]
+
+
 async def test_what_changed_its_place_or_type_is_right(key, akvs, binterface, file):
     values = [
         {"l": [FRAME[:9], FRAME[9:19]], "a": np.arange(100)},
