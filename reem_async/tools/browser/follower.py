@@ -314,6 +314,7 @@ class Follower:
 
     def shown_on(self, pages: int) -> None:
         self.arrays.rate = BACKGROUND_RATE * (1 if pages else UNSEEN)
+        self._owes.set()  # what waits for it may be due sooner
 
     @property
     def hears_of_changes(self) -> bool:
