@@ -249,6 +249,23 @@ def test_nothing_is_changed_by_looking(server):
                 looking["q"].write(1)
 
 
+def test_keys_that_the_user_may_not_look_at_are_left_out(server):
+    with redis.Redis.from_url(server.url) as client:
+        client.execute_command("ACL", "SETUSER", "limited", "on", ">pw", "~q*", "&*", "+@all")
+        client.set("q", "1")
+        client.set("secret", "2")
+        with reem.RedisInterface(url_of_user(server.url, "limited", "pw")) as interface:
+            looking = reem.KeyValueStore(interface).raw
+            assert looking.keys() == ["q"]
+            with looking.watch() as watch:
+                assert watch.next(5).path == "q"
+                client.set("secret", "3")
+                client.set("q", "4")
+                assert watch.next(5).value == 4
+            with pytest.raises(NotAllowed):
+                looking["secret"].read()
+
+
 def test_a_loop_ends_with_its_interface_and_a_dropped_one_is_let_go(front, raw, key):
     raw.set(key("q"), "1")
 

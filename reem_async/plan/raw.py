@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import orjson
 
-from ..errors import BadKey, BadType, BadValue, NotAllowed, TooLarge, WrongType
+from ..errors import BadKey, BadType, BadValue, NotAllowed, TooLarge, WrongType, is_of_command
 from . import Command, Plan, Reply, blamed
 from .documents import nested_over
 from .keys import DOCUMENT
@@ -116,11 +116,17 @@ def raw_name(key: bytes) -> str | None:
 
 
 def kinds_of(names: Sequence[str]) -> Plan:
-    """Plan to ask for the Redis types of keys: a dict, without those of REEM and those that are not there."""
+    """Plan to ask for the Redis types of keys: a dict.
+
+    Those of REEM, those that are not there, and those that the user may not look at are left out.
+    """
 
     def decode(replies: Sequence[Reply]) -> dict[str, str]:
-        kinds = [_raised(name, reply, "TYPE").decode() for name, reply in zip(names, replies, strict=True)]
-        return {name: kind for name, kind in zip(names, kinds, strict=True) if kind not in (DOCUMENT, "none")}
+        kinds: dict[str, str] = {}
+        for name, reply in zip(names, replies, strict=True):
+            if not isinstance(reply, NotAllowed) or is_of_command(reply):
+                kinds[name] = _raised(name, reply, "TYPE").decode()
+        return {name: kind for name, kind in kinds.items() if kind not in (DOCUMENT, "none")}
 
     return Plan([("TYPE", name) for name in names], decode)
 
