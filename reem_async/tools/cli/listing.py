@@ -12,7 +12,7 @@ from ...connection import RedisInterface
 from ...errors import BadData, BadKey, MissingKey, ReemError, WrongKind
 from ...plan.paths import check_top_key, parse, parse_pattern
 from ...store.catalog import Outline, names, outline
-from .options import DEFAULT_URL, AsJson, Namespace, Url, complete_path
+from .options import AsJson, complete_path, with_server
 from .output import (
     clean,
     columns,
@@ -29,7 +29,7 @@ from .output import (
     width,
 )
 from .raw import matching, raw_found
-from .running import NOTHING, for_users, run
+from .running import NOTHING, for_users
 
 # Entries that are drawn of one dict or list: lists of thousands of numbers would fill the screen.
 _MOST_CHILDREN = 50
@@ -46,7 +46,8 @@ OnePattern = Annotated[
 _AT_ONCE = 64  # round trips that are under way together
 
 
-def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_URL, namespace: Namespace = "") -> None:
+@with_server("ls")
+async def ls(interface: RedisInterface, pattern: OnePattern = "*", as_json: AsJson = False) -> int:
     """List keys with type and size.
 
     One line for each key that the pattern names: name, type, what it is, bytes. Arrays are not
@@ -61,36 +62,29 @@ def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_UR
         reem ls 'robot.*'          what is directly below robot
         reem ls --json | jq -r .path
     """
-
-    async def work(interface: RedisInterface) -> int:
-
-        # All rows before the first is printed: the widths of the columns depend on them. JSON lines go out as they
-        # come.
-        rows = []
-        async for raw, node in found_all(interface, pattern):
-            if as_json:
-                emit_json(outline_json(node, raw, whole=False))
-            rows.append(
-                (typed(node.path), f"raw {raw}" if raw else node.kind, describe(node, 48), size_text(node.size))
-            )
-        if not as_json:
-            columns(rows, ("bold", "cyan", "", "green"), right=frozenset({3}), shrink=(2, 0))
-        if others := sum(row[1].startswith("raw ") for row in rows):
-            note(f"{counted(others, 'key')} of other programs, marked raw")
-        return 0 if rows else _nothing(pattern, interface)
-
-    run("ls", work, url, namespace)
+    # All rows before the first is printed: the widths of the columns depend on them. JSON lines go out as they
+    # come.
+    rows = []
+    async for raw, node in found_all(interface, pattern):
+        if as_json:
+            emit_json(outline_json(node, raw, whole=False))
+        rows.append((typed(node.path), f"raw {raw}" if raw else node.kind, describe(node, 48), size_text(node.size)))
+    if not as_json:
+        columns(rows, ("bold", "cyan", "", "green"), right=frozenset({3}), shrink=(2, 0))
+    if others := sum(row[1].startswith("raw ") for row in rows):
+        note(f"{counted(others, 'key')} of other programs, marked raw")
+    return 0 if rows else _nothing(pattern, interface)
 
 
-def tree(
+@with_server("tree")
+async def tree(
+    interface: RedisInterface,
     pattern: OnePattern = "*",
     whole: Annotated[
         bool, typer.Option("--all", help=f"Also what comes after the first {_MOST_CHILDREN} entries of a dict or list.")
     ] = False,
     as_json: AsJson = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
+) -> int:
     """Show what is below keys; arrays as dtype, shape and size, without fetching them.
 
     Keys of programs without REEM come last, marked with their Redis type, such as (raw hash). One round trip for
@@ -101,22 +95,17 @@ def tree(
         reem tree robot.arm
         reem tree 'cam_*'
     """
-
-    async def work(interface: RedisInterface) -> int:
-
-        count = 0
-        async for raw, node in found_all(interface, pattern):
-            count += 1
-            if as_json:
-                emit_json(outline_json(node, raw, whole=True))
-                continue
-            mark = styled(f"  (raw {raw})", "dim") if raw else ""
-            for line in _drawn(node, typed(node.path), "", "", None if whole else _MOST_CHILDREN):
-                emit(line + mark)
-                mark = ""
-        return 0 if count else _nothing(pattern, interface)
-
-    run("tree", work, url, namespace)
+    count = 0
+    async for raw, node in found_all(interface, pattern):
+        count += 1
+        if as_json:
+            emit_json(outline_json(node, raw, whole=True))
+            continue
+        mark = styled(f"  (raw {raw})", "dim") if raw else ""
+        for line in _drawn(node, typed(node.path), "", "", None if whole else _MOST_CHILDREN):
+            emit(line + mark)
+            mark = ""
+    return 0 if count else _nothing(pattern, interface)
 
 
 def _nothing(pattern: str, interface: RedisInterface) -> int:

@@ -98,12 +98,8 @@ def appearing(target: FilePath, log: Log, *, overwrite: bool) -> Iterator[FilePa
     if target.exists() and not overwrite:
         raise BadValue(str(there_already(target)))
     try:
-        part = PartFile(target, replace=overwrite)
-        try:
+        with PartFile(target, replace=overwrite) as part:
             yield part.path
-            part.finish()
-        finally:
-            part.close()
     except FileExistsError as error:  # another program has created it in the meantime
         raise BadValue(str(error)) from None
     except OSError as error:
