@@ -14,6 +14,7 @@ from reem_async import StateChange, timeout
 from reem_async import __version__ as __version__
 from reem_async._installation import CURE, original_reem
 from reem_async.concurrency.queues import Every, Last, Newest
+from reem_async.coordination.clock import ClockOffset
 from reem_async.coordination.presence import NodeEvent, NodeInfo
 from reem_async.plan.placeholders import Unreadable
 from reem_async.plan.typed import Shape
@@ -57,13 +58,13 @@ def __getattr__(name: str) -> Any:
 
 __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "Busy", "BytesShip", "CallTimeout",
-    "CallbackSubscriber", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection",
-    "InterfaceClosed", "Jpeg", "JpegShip", "KeyValueStore", "Last", "LeaseLost", "LoginRefused", "MissingDocument",
-    "MissingKey", "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed",
-    "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter", "PartialWrite",
-    "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
-    "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady",
-    "ServerReadOnly", "ServiceError", "ServiceLost", "Shape", "Silent", "SilentSubscriber", "SpecialDatatypeShip",
-    "Stale", "StateChange", "TlsRefused", "TooDeep", "TooLarge", "Unreadable", "Update", "WriteOnly", "Writer",
-    "WrongKind", "WrongLoop", "WrongType", "timeout",
+    "CallbackSubscriber", "ClockOffset", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every",
+    "InsecureConnection", "InterfaceClosed", "Jpeg", "JpegShip", "KeyValueStore", "Last", "LeaseLost", "LoginRefused",
+    "MissingDocument", "MissingKey", "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent",
+    "NodeInfo", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter",
+    "PartialWrite", "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader",
+    "RedisInterface", "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing",
+    "ServerNotReady", "ServerReadOnly", "ServiceError", "ServiceLost", "Shape", "Silent", "SilentSubscriber",
+    "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "TooLarge", "Unreadable", "Update",
+    "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType", "timeout",
 ]  # fmt: skip

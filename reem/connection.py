@@ -192,6 +192,7 @@ class RedisInterface:
     states = makes(reem_async.RedisInterface.states, StateIterator, _DIRECT)
     on_state = calls(reem_async.RedisInterface.on_state, _DIRECT)
     nodes = runs(reem_async.RedisInterface.nodes)
+    clock = runs(reem_async.RedisInterface.clock)
     watch_nodes = makes(reem_async.RedisInterface.watch_nodes, NodeWatch, attrgetter("_followers"))
     initialize = runs(reem_async.RedisInterface.initialize)
 

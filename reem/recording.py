@@ -60,6 +60,7 @@ class Recorder:
     start = waits(core.Recorder.start)
     stop = waits(core.Recorder.stop)
     wait = waits(core.Recorder.wait)
+    save = waits(core.Recorder.save)
 
     def __enter__(self) -> Self:
         self.start()

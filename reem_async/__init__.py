@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .concurrency.queues import Every, Last, Newest
     from .concurrency.timeouts import timeout
     from .connection import RedisInterface
+    from .coordination.clock import ClockOffset
     from .coordination.parameters import Parameter
     from .coordination.presence import NodeEvent, NodeInfo
     from .errors import *
@@ -29,21 +30,22 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "Busy", "BytesShip", "CallTimeout",
-    "CallbackSubscriber", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection",
-    "InterfaceClosed", "Jpeg", "JpegShip", "KeyValueStore", "Last", "LeaseLost", "LoginRefused", "MissingDocument",
-    "MissingKey", "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed",
-    "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter", "PartialWrite",
-    "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
-    "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady",
-    "ServerReadOnly", "ServiceError", "ServiceLost", "Shape", "Silent", "SilentSubscriber", "SpecialDatatypeShip",
-    "Stale", "StateChange", "TlsRefused", "TooDeep", "TooLarge", "Unreadable", "Update", "WriteOnly", "Writer",
-    "WrongKind", "WrongLoop", "WrongType", "timeout",
+    "CallbackSubscriber", "ClockOffset", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every",
+    "InsecureConnection", "InterfaceClosed", "Jpeg", "JpegShip", "KeyValueStore", "Last", "LeaseLost", "LoginRefused",
+    "MissingDocument", "MissingKey", "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent",
+    "NodeInfo", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter",
+    "PartialWrite", "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader",
+    "RedisInterface", "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing",
+    "ServerNotReady", "ServerReadOnly", "ServiceError", "ServiceLost", "Shape", "Silent", "SilentSubscriber",
+    "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "TooLarge", "Unreadable", "Update",
+    "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType", "timeout",
 ]  # fmt: skip
 
 _HOMES = {
     ".concurrency.queues": ["Every", "Last", "Newest"],
     ".concurrency.timeouts": ["timeout"],
     ".connection": ["RedisInterface"],
+    ".coordination.clock": ["ClockOffset"],
     ".coordination.parameters": ["Parameter"],
     ".coordination.presence": ["NodeEvent", "NodeInfo"],
     ".plan.placeholders": ["Unreadable"],

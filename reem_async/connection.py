@@ -6,9 +6,11 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Self
 
+from .coordination.clock import ClockOffset, ServerClock
 from .coordination.presence import NodeInfo, NodeWatch, Presence, in_order, listed
 from .errors import SELF_EXPLANATORY
 from .local import MEMORY, LocalPath
+from .plan.arguments import check_number
 from .session import Session
 from .ships.base import SpecialDatatypeShip
 from .transport import NewTransport
@@ -87,7 +89,8 @@ class RedisInterface:
         shared = LocalPath(local, local_memory)
         self.session = Session(host, ships, namespace, timeout, options, self._new_transport, shared, wait)
         self.session.interface = self
-        self._presence = None if name is None else Presence(self.session, name)
+        self._clock = ServerClock(self.session)
+        self._presence = None if name is None else Presence(self.session, self._clock, name)
         self._client: Any = None
         # An event loop that ends without `close` (asyncio.run of a script) takes its connections and tasks with it.
         self.session.transport.at_end = self.session.release
@@ -171,6 +174,19 @@ class RedisInterface:
         Each `NodeEvent` has `kind`, "joined" or "left", and `node`. Five times a second it makes two round trips.
         """
         return NodeWatch(self.session)
+
+    async def clock(self, *, max_age: float = 60.0) -> ClockOffset:
+        """Return by how much the server's clock is ahead of this computer's: `offset`, `bound`, `measured`.
+
+        Add `offset` to `time.time()` for the server's time. Eight round trips, none if it was measured in the last
+        `max_age` seconds and this computer's clock was not set since. Of a cluster it is the clock of one server.
+
+        Raises:
+            NotAllowed: The user lacks the right to TIME.
+            BadValue: `max_age` is below 0.
+        """
+        check_number("max_age", max_age, "use seconds, 0 or more")
+        return await self._clock.offset(max_age)
 
     async def initialize(self) -> None:
         """Connect now, and check that the server can be used. Optional; one round trip, idempotent.

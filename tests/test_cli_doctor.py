@@ -10,6 +10,7 @@ import redis
 from clikit import CommandLine
 from conftest import PLAIN
 
+from reem_async import ClockOffset
 from reem_async.server import EmbeddedServer
 from reem_async.server.cluster import EmbeddedCluster
 from reem_async.tools.cli import checks
@@ -157,12 +158,12 @@ def test_what_the_facts_mean(check, info, config, status):
 
 
 def test_clock_and_latency():
-    assert checks.clock(0.005, 0.001).status == OK
-    assert checks.clock(0.05, 0.045).status == OK  # it may be the way there
-    assert checks.clock(-3.0, 0.001) == (
+    assert checks.clock(ClockOffset(0.005, 0.001, 0.0)).status == OK
+    assert checks.clock(ClockOffset(0.05, 0.045, 0.0)).status == OK  # it may be the way there
+    assert checks.clock(ClockOffset(-3.0, 0.001, 0.0), "on arm ") == (
         "clock",
         WARN,
-        "the server's clock is 3000.0 ms behind, give or take 1.0 ms",
+        "on arm the server's clock is 3000.0 ms behind, give or take 1.0 ms",
         "set both by NTP or chrony; until then `reem delay` and time stamps are off by as much",
     )
     slow = checks.latency([0.01] * 197 + [0.5] * 3)

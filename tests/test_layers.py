@@ -124,7 +124,7 @@ ORDER = [
     {"local"},
     {"transport"},
     {"session"},
-    {"coordination.presence"},
+    {"coordination.presence", "coordination.clock"},
     {"connection"},
     {"pubsub"},
     {"store", "coordination"},
@@ -187,7 +187,7 @@ def folder(module):
     parts = module.split(".")[1:]
     # The first belongs to the plans, the second to the command line, the third to the interface; the rest of their
     # packages uses all that is below it.
-    if parts in (["legacy", "olddata"], ["legacy", "command"], ["coordination", "presence"]):
+    if parts in (["legacy", "olddata"], ["legacy", "command"], ["coordination", "presence"], ["coordination", "clock"]):
         return ".".join(parts)
     return ".".join(parts[:2] if parts[:1] == ["tools"] else parts[:1])
 

@@ -29,6 +29,7 @@ from ..plan import Command, Plan, Reply, raise_refused
 from ..plan.keys import PRESENCE, Keys
 from ..plan.paths import shorten
 from ..session import Session
+from .clock import ClockOffset, ServerClock
 
 logger = logging.getLogger("reem.presence")
 
@@ -42,6 +43,7 @@ _CLEANING = 40  # renewals after which a node removes from the set what has left
 _REFUSED = 5.0  # seconds between attempts of a node that the server refuses
 _FAREWELL = 0.3  # seconds that closing an interface takes at most for removing its key
 _RECENT = 60.0  # seconds for which a node is said to publish a key after an update of it
+_CLOCK_AGE, _CLOCK_READINGS = 10.0, 3  # seconds after which a node measures its clock again, and round trips for it
 _MOST_NODES, _MOST_NAMES, _LONGEST_TEXT = 10_000, 50, 600
 _MOST_EVENTS = 1000  # that wait for a loop over events
 
@@ -62,6 +64,8 @@ class NodeInfo:
         publishes: The top-level keys that it has published in the last minute; 50 at most.
         serves: The services that it offers.
         owns: The top-level keys that it owns.
+        clock: By how much the server's clock is ahead of its computer's, measured in the last ten seconds; None if it
+            may not ask, or is of an earlier version.
     """
 
     name: str
@@ -72,6 +76,7 @@ class NodeInfo:
     publishes: tuple[str, ...] = ()
     serves: tuple[str, ...] = ()
     owns: tuple[str, ...] = ()
+    clock: ClockOffset | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +148,19 @@ def _listing(keys: Keys) -> Plan:
 def _decoded(node_id: str, raw: Any) -> NodeInfo | None:
     try:
         said = json.loads(raw)
-        names = [tuple(_text(each) for each in said[kind][:_MOST_NAMES]) for kind in ("publishes", "serves", "owns")]
+        kinds = "publishes", "serves", "owns"
+        publishes, serves, owns = (tuple(_text(each) for each in said[kind][:_MOST_NAMES]) for kind in kinds)
         pid, since = said["pid"], said["since"]
         if type(pid) is not int or not 0 < pid < 1 << 32 or type(since) is not float or not 0 <= since < math.inf:
             return None
-        return NodeInfo(check_node_name(said["name"]), _text(said["host"]), pid, node_id, since, *names)
+        name, host, clock = check_node_name(said["name"]), _text(said["host"]), _clock(said.get("clock"))
+        return NodeInfo(name, host, pid, node_id, since, publishes, serves, owns, clock)
     except (ValueError, TypeError, KeyError, RecursionError):
         return None
+
+
+def _clock(said: Any) -> ClockOffset | None:
+    return ClockOffset(*map(float, said)) if said is not None and math.isfinite(sum(said)) else None
 
 
 def _text(value: object) -> str:
@@ -173,8 +184,9 @@ class Presence:
     It starts with the first connection. A forked child that uses the interface is another node.
     """
 
-    def __init__(self, session: Session, name: str) -> None:
+    def __init__(self, session: Session, clock: ServerClock, name: str) -> None:
         self._session = session
+        self._clock = clock
         self._name = check_node_name(name)
         _group(session)  # raises BadKey if the namespace leaves no room
         self._host = socket.gethostname()[:_LONGEST_TEXT]
@@ -200,7 +212,9 @@ class Presence:
                 now = time.monotonic()
                 pause = _RENEWAL
                 try:
-                    await self._renew(node_id, now - began)
+                    # Not before it is announced, which is not to wait for it.
+                    clock = await self._clock.known(_CLOCK_AGE, _CLOCK_READINGS) if turns else None
+                    await self._renew(node_id, now - began, clock)
                     if turns % _CLEANING == 0:
                         await listed(self._session)
                     turns += 1
@@ -217,13 +231,15 @@ class Presence:
             if self._ids.get(place) is node_id:
                 del self._ids[place]
 
-    async def _renew(self, node_id: str, since: float) -> None:
+    async def _renew(self, node_id: str, since: float, clock: ClockOffset | None) -> None:
         keys, session = _group(self._session), self._session
         # In turn with `leave`, which must not be followed by a renewal.
         async with session.transport.ordered(_index(keys)):
             if not self._over:
                 told = session.activities.told(_RECENT, _MOST_NAMES)
                 about = {"name": self._name, "host": self._host, "pid": os.getpid(), "since": round(since, 3)}
+                if clock is not None:
+                    about["clock"] = clock.offset, clock.bound, clock.measured
                 await session.run(_renewal(keys, node_id, about | told))
 
     async def leave(self) -> None:

@@ -28,6 +28,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ...errors import BadKey, ServerFailed
 from .api import Api, Events
 from .arrays import Arrays
+from .saving import Saving
 from .source import Source, path_of, visible
 
 # Access checks: the Host header, the token, where a request comes from, and what answers carry.
@@ -256,6 +257,7 @@ def create_app(
     # Set when the program is to end: open streams of events would keep it waiting.
     app.state.ending = False
     routes = [*api.routes(), *Arrays(source).routes(), *Events(source, lambda: app.state.ending).routes()]
+    routes += Saving(source).routes()
     app.router.routes.extend(
         [
             Route("/", view, methods=["GET"]),

@@ -274,6 +274,17 @@ class History:
 
     # --- what there was
 
+    def first_trees(self) -> Iterator[tuple[str, Any]]:
+        """Yield what each key held where the past begins, as far as it is known."""
+        for name, line in self._lines.items():
+            tree = line.state(0.0)
+            if tree is not MISSING and tree is not UNKNOWN:
+                yield name, tree
+
+    def changes(self) -> Iterable[BufferedChange]:
+        """Return all changes since, in order."""
+        return self._all
+
     @property
     def names(self) -> Iterable[str]:
         return self._lines.keys()

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import NamedTuple
 
+from ...coordination.clock import ClockOffset
 from .output import named, size_text
 
 OK, WARN, FAIL, UNKNOWN = "ok", "warn", "fail", "unknown"
@@ -112,11 +113,10 @@ def latency(seconds: Sequence[float]) -> Finding:
     return Finding("latency", OK, text)
 
 
-def clock(ahead: float, within: float) -> Finding:
-    text = f"the server's clock is {abs(ahead) * 1000:.1f} ms {'ahead' if ahead > 0 else 'behind'}"
-    text += f", give or take {within * 1000:.1f} ms"
+def clock(found: ClockOffset, where: str = "") -> Finding:
+    text = f"{where}the server's clock is {found}"
     # Only what cannot be the uncertainty of the measurement itself.
-    if abs(ahead) - within > _CLOCK_APART:
+    if abs(found.offset) - found.bound > _CLOCK_APART:
         remedy = "set both by NTP or chrony; until then `reem delay` and time stamps are off by as much"
         return Finding("clock", WARN, text, remedy)
     return Finding("clock", OK, text)

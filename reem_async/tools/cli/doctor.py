@@ -16,7 +16,8 @@ import typer
 
 from ..._installation import CURE, original_reem
 from ...connection import RedisInterface
-from ...errors import BadKey, NoJsonSupport, RedisError, ReemError
+from ...coordination.clock import measure
+from ...errors import BadKey, NoJsonSupport, NotAllowed, RedisError, ReemError
 from ...legacy.convert import find
 from ...local.segment import Segment, reason_against
 from ...plan.attachments import orphans, remove_orphans
@@ -134,6 +135,8 @@ async def _findings(url: str, namespace: str, *, clean: bool) -> AsyncIterator[t
         yield "", await _orphans(interface, clean=clean)
         yield "", await _others(interface)
         yield "", await _publishers(interface)
+        async for finding in _clocks(interface):
+            yield "", finding
         yield "", await _sharing()
     except RedisError as error:
         yield "", Finding("server", FAIL, for_users(error))
@@ -263,18 +266,21 @@ async def _latency(server: Transport) -> Finding:
 
 
 async def _clock(server: Transport) -> Finding:
-    """Compare clocks: the server read its own in the middle of the shortest round trip, more or less."""
-    readings: list[tuple[float, float]] = []
-    for _ in range(_CLOCK_READINGS):
-        start = time.time()
-        (reply,) = await server.roundtrip([("TIME",)])
-        end = time.time()
-        if isinstance(reply, Exception):
-            return checks.not_allowed("clock", "TIME")
-        # The shorter the round trip, the less the reading can be off: half of it at most.
-        readings.append(((end - start) / 2, int(reply[0]) + int(reply[1]) / 1e6 - (start + end) / 2))
-    within, ahead = min(readings)
-    return checks.clock(ahead, within)
+    try:
+        return checks.clock(await measure(server, _CLOCK_READINGS))
+    except NotAllowed:
+        return checks.not_allowed("clock", "TIME")
+
+
+async def _clocks(interface: RedisInterface) -> AsyncIterator[Finding]:
+    """Yield what named programs say of the clocks of their computers, a line for each computer."""
+    try:
+        nodes = await interface.nodes()
+    except RedisError:
+        return
+    hosts = {node.host: node.clock for node in nodes if node.clock is not None}
+    for host, offset in sorted(hosts.items()):
+        yield checks.clock(offset, f"on {host} ")
 
 
 def _of_installation() -> Iterator[Finding]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import sys
+import time
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ...concurrency.queues import Last
 from ...concurrency.tasks import come_second, keep_memory, stand_back
 from ...connection import RedisInterface
 from ...coordination.calls import statistics
@@ -23,10 +26,12 @@ from .output import clean, emit, emit_json, figures, note, size_text
 from .running import CommandFailed, guarded, run
 
 if TYPE_CHECKING:
+    from ...pubsub.subscribers import Watch
     from ..recording import Recorder, RecorderStatus
 
 # Seconds between two lines that say how it is getting on.
 _SHOWN_EVERY = 0.5
+_MOST_EDGES = 1000  # values of the path of --on that wait
 _ASKED_EVERY = 1.0  # seconds between two questions to the servers of services to publish their calls
 
 
@@ -45,6 +50,16 @@ def record(
     compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
     force: Force = False,
     ships: Ships = None,
+    last: Annotated[
+        float | None,
+        typer.Option(min=0.1, metavar="SECONDS", help="Keep so many in memory; write them at Ctrl-C, or see --on."),
+    ] = None,
+    on: Annotated[
+        str | None, typer.Option("--on", metavar="PATH", help="With --last: write when the value there becomes true.")
+    ] = None,
+    after: Annotated[
+        float, typer.Option(min=0.0, metavar="SECONDS", help="With --on: write what follows for so long, too.")
+    ] = 5.0,
     services: Annotated[bool, typer.Option("--services", help="Record calls of services too, under _calls.")] = False,
     background: Annotated[bool, typer.Option("--background", help="Use only idle processor time.")] = False,
     as_json: AsJson = False,
@@ -66,6 +81,10 @@ def record(
     With --services, the servers of services publish each call that they have answered, with arguments, answer (or
     error) and seconds, under the key _calls, by service. It is removed at the end.
 
+    With --last nothing is written at first. Ctrl-C writes the last seconds. With --on a file is written each time the
+    value at a path becomes true, with {time} in its name in UTC, but not while another one is being written.
+    The memory has 256 MB: what it cannot hold is dropped, oldest first, and counted.
+
     With --background it disturbs them least, but drops and counts updates if they use all processors.
 
     Examples:
@@ -74,7 +93,10 @@ def record(
         reem record --background            beside a tight control loop
         reem record --services policy       its updates, and all calls
         reem record --sample keys.csv       its lines: arm.joint, 0.01
+        reem record --last 60 --on fault.active -o 'crash-{time}.mcap'
     """
+    if on is not None and last is None:
+        raise typer.BadParameter("--on needs --last: how many seconds before it are written")
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
     if services and "*" not in wanted:
         wanted.append(CALLS)
@@ -97,22 +119,29 @@ def record(
             raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
         # Refused here if the file is there already: nothing was sent for it yet.
         recorder = Recorder(
-            interface, wanted, output, sample=sample, keyframe=keyframe, compression=compression, overwrite=force
+            *(interface, wanted, output),
+            sample=sample,
+            keyframe=keyframe,
+            compression=compression,
+            overwrite=force,
+            last=last,
         )
+        box = None if last is None else _Box(recorder, output, on, after, force=force, as_json=as_json)
         # Whether there is a recording: Ctrl-C before that ends with 130 and leaves no file.
         begun = False
         try:
             async with recorder:
                 begun = True
-                _begin(recorder, duration, as_json)
-                async with _calls(interface) if services else nullcontext(), _progress(recorder, as_json):
-                    await recorder.wait(duration)
+                async with box.saving(interface) if box else nullcontext():
+                    _begin(recorder, duration, as_json, box)
+                    async with _calls(interface) if services else nullcontext(), _progress(recorder, as_json):
+                        await recorder.wait(duration)
         except asyncio.CancelledError:  # Ctrl-C is how a recording ends; it may have failed all the same
             if not begun:  # there is no recording
                 raise
             await recorder.stop()
         finally:
-            if begun:
+            if begun and box is None:
                 _end(recorder, as_json)
                 if not recorder.status.messages:
                     note(_nothing(wanted, recorder.status.failed))
@@ -143,19 +172,87 @@ async def _calls(interface: RedisInterface) -> AsyncIterator[None]:
             await KeyValueStore(interface)[CALLS].delete()
 
 
+class _Box:
+    """What a black box writes, and when."""
+
+    def __init__(
+        self, recorder: Recorder, output: Path, on: str | None, after: float, *, force: bool, as_json: bool
+    ) -> None:
+        self._recorder = recorder
+        self._output = output
+        self._on = on
+        self._after = after
+        self._force = force
+        self._as_json = as_json
+
+    @property
+    def when(self) -> str:
+        return f"when {self._on} becomes true" if self._on is not None else "at Ctrl-C"
+
+    @asynccontextmanager
+    async def saving(self, interface: RedisInterface) -> AsyncIterator[None]:
+        """Write when it is time, as long as the block runs; without a path that says so, at its end."""
+        if self._on is None:
+            try:
+                yield
+            finally:
+                await self._save(0.0)
+            return
+        async with KeyValueStore(interface).at(self._on).watch(Last(_MOST_EDGES)) as updates:
+            following = asyncio.create_task(self._follow(updates))
+            try:
+                yield
+            finally:
+                following.cancel()
+                await asyncio.gather(following, return_exceptions=True)
+
+    async def _follow(self, updates: Watch) -> None:
+        was, saving = False, None
+        try:
+            async for update in updates:
+                is_true = not update.deleted and _is_true(update.data)
+                if is_true and not was and not update.initial and (saving is None or saving.done()):
+                    saving = asyncio.create_task(self._save(self._after))
+                was = is_true
+        finally:
+            if saving is not None:
+                await saving
+
+    async def _save(self, after: float) -> None:
+        name = str(self._output).replace("{time}", time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()))
+        try:
+            path = await self._recorder.save(name, after, overwrite=self._force)
+        except ReemError as error:  # the next one may be written
+            note(f"not saved: {error}")
+            return
+        size = path.stat().st_size
+        if self._as_json:
+            emit_json({"saved": str(path), "bytes": size})
+        else:
+            emit(clean(f"saved {path}: {size_text(size)}; {_missing(self._recorder.status)}"))
+        sys.stdout.flush()
+
+
+def _is_true(value: Any) -> bool:
+    return bool(value) if isinstance(value, bool | int | float | str | list | dict | None) else True
+
+
 def _progress(recorder: Recorder, as_json: bool) -> AbstractAsyncContextManager[None]:
     def text() -> str:
         status = recorder.status
         line = f"{_clock(status.seconds)}  {status.messages} messages  {status.rate:.0f}/s"
-        return f"{line}  {size_text(status.file_bytes)} in the file  {_missing(status)}"
+        where = f"{size_text(status.file_bytes)} in the file" if status.file_bytes else "in memory"
+        return f"{line}  {where}  {_missing(status)}"
 
     return progress(text, lambda: figures(recorder.status, 3), _SHOWN_EVERY, as_json=as_json)
 
 
-def _begin(recorder: Recorder, duration: float | None, as_json: bool) -> None:
+def _begin(recorder: Recorder, duration: float | None, as_json: bool, box: _Box | None) -> None:
     """Say that it has begun: from now on nothing is missed, and Ctrl-C completes the file."""
     if as_json:
         emit_json(figures(recorder.status, 3))
+    elif box is not None:
+        note(f"recording into memory, and into {recorder.path} {box.when}")
     else:
         note(f"recording into {recorder.path} " + ("until Ctrl-C" if duration is None else f"for {duration:g} s"))
 
@@ -184,6 +281,7 @@ def _missing(status: RecorderStatus) -> str:
     extra = {
         "gaps": status.gaps,
         "unreadable or not recordable": status.lost,
+        "steps of a publisher's clock": status.clock_steps,
         "samples late": status.late,
         "samples failed": status.failed,
     }

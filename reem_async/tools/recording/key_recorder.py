@@ -33,6 +33,7 @@ from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer, present_keys
 from ...session import Session
 from ...store.document import opened
+from .blackbox import BlackBox
 from .format import Kind, Role
 from .key_queue import Item, KeyQueue
 from .stored import New, Unchanged, pruned
@@ -181,6 +182,8 @@ _PAUSE = 0.1
 _LET_PASS = 0.004
 """Seconds, at most, from a large update to reading it. The server is busy with its publisher, others wait behind
 that: reading it in the same moment would make them wait twice as long. A recorder has time."""
+_STEP = 0.01
+"""Seconds: clocks that are only adjusted do not go back by as much."""
 _FAST = 20_000_000
 """Nanoseconds between large updates that come so fast that the next one might not find this one fetched."""
 
@@ -189,7 +192,7 @@ class Collector(Protocol):
     """What is needed of the recorder, which imports this module."""
 
     session: Session
-    writer_thread: WriterThread
+    writer_thread: WriterThread | BlackBox
     clock: Clock
     arrivals: Arrivals
     patterns: list[Pattern]
@@ -212,6 +215,8 @@ class KeyRecorder:
         self._reader = KeyReader(collector.session, keys, self._queue, fence, collector.fetching)
         self._known = False
         self._complaint = ""  # why it could not be read the last time
+        self._published = 0.0  # the publisher's time of the last update
+        self._stepped = False  # that went back, which was reported
         self._last_large = 0  # the log time of the last update that was fetched
         self._whole = any(not pattern.rest and pattern.concerns((name,)) for pattern in collector.patterns)
         self.busy: asyncio.Task[None] | None = None  # the task that fetches
@@ -226,6 +231,7 @@ class KeyRecorder:
     def on_event(self, event: Event) -> None:
         arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)
         stamp = self._collector.clock.stamp(arrived), published(event.time), event.sequence
+        self._check_clock(event)
         self.looks.heard += 1
         if event.missed:  # a broken connection is noticed by the recorder, for all keys
             self.lost(event.missed)
@@ -240,6 +246,21 @@ class KeyRecorder:
             # What waits to be written must keep no slot from its publisher, which has few for the next frames.
             value = mapped(event.value, _copied) if event.local else event.value
             self._add(Item(role, event.path, value, stamp, self._queue.order, event.size))
+
+    def _check_clock(self, event: Event) -> None:
+        """Count where the publisher's time of the key goes back, whoever publishes it."""
+        back, self._published = self._published - event.time, event.time
+        if back > _STEP:
+            counts = self._collector.writer_thread.counts
+            counts.clock_steps += 1
+            if not self._stepped:
+                logger.warning(
+                    "%s: the publisher's time went back by %.3f s: its clock was set, or programs with different "
+                    "clocks publish it (reported once; `clock_steps` counts)",
+                    self._name,
+                    back,
+                )
+            self._stepped = True
 
     def lost(self, missed: int | None) -> None:
         self._reader.forget()

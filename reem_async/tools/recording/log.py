@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path as FilePath
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -32,6 +32,8 @@ from .times import Instant, nanoseconds, seconds
 _CACHED_TREES = 256
 _END = 2**63 - 1
 _NAMED = 10  # top-level keys that an error lists
+RecordedClock = Literal["recorder", "publisher"]
+"""Whose times of updates are asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -501,13 +503,16 @@ class LogPath:
         return self._log.value_at(self.path, instant)
 
     def history(
-        self, start: Instant | None = None, end: Instant | None = None
+        self, start: Instant | None = None, end: Instant | None = None, *, clock: RecordedClock = "recorder"
     ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any] | list[Any]]:
         """Return when the value was updated and what it was then.
 
         Args:
             start: The first instant; the beginning of the recording if not given.
             end: The last instant; the end of the recording if not given.
+            clock: "recorder": the times at which the recorder received the updates, which only grow. "publisher": the
+                times at which they were published, on the publishers' clocks, in the order of receipt. They go back
+                where such a clock was set back. What was only stored or sampled has no such time and is left out.
 
         Returns:
             The times, in seconds since 1970: float64, (N,). The values: one array, the first axis being
@@ -515,18 +520,23 @@ class LogPath:
             numbers; else a list. Instants at which nothing was there are left out, and so are values in
             which anything is damaged or was not recorded, which `Log.unreadable` counts.
         """
-        pairs = list(self.values(start, end))
+        pairs = list(self.values(start, end, clock=clock))
         times = np.array([time for time, _ in pairs], np.float64)
         return times, stacked([value for _, value in pairs])
 
-    def values(self, start: Instant | None = None, end: Instant | None = None) -> Iterator[tuple[float, Any]]:
+    def values(
+        self, start: Instant | None = None, end: Instant | None = None, *, clock: RecordedClock = "recorder"
+    ) -> Iterator[tuple[float, Any]]:
         """Yield what `history` returns one by one, for what is larger than memory."""
+        if clock not in ("recorder", "publisher"):
+            raise BadValue(f"clock={clock!r:.40} is neither 'recorder' nor 'publisher'")
         after = -1 if start is None else nanoseconds(start) - 1
         until = _END if end is None else nanoseconds(end)
-        for ns, tree in self._log._past.changes(self.path, after, until):
-            whole = self._log._whole(tree)
-            if whole is not MISSING:
-                yield seconds(ns), whole
+        for refs, repeats, tree in self._log._past.following(self.path, after, until):
+            ns = refs[0].time if clock == "recorder" else self._log._past.published(refs)
+            if repeats or ns is None or (whole := self._log._whole(tree)) is MISSING:
+                continue
+            yield seconds(ns), whole
 
     def __repr__(self) -> str:
         return f"<{show(self.path)} of {self._log!r}>"

@@ -243,8 +243,8 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             if value is not _DAMAGED:
                 yield ref, stream, value
 
-    def following(self, path: Path, after: int, until: int) -> Iterator[tuple[int, bool, Any]]:
-        """Yield what was at a full path after each instant with news on it, and whether that only repeats.
+    def following(self, path: Path, after: int, until: int) -> Iterator[tuple[list[Ref], bool, Any]]:
+        """Yield the news on a full path of each instant, whether it only repeats, and what was there after it.
 
         If a part of the file is damaged, keyframes are news too.
         """
@@ -269,13 +269,13 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 value = self._inside(tree, path[len(anchor) :])
                 repeats = is_whole and value is not MISSING and last is not MISSING and same(value, last)
                 last = value
-                yield refs[0].time, repeats, value
+                yield refs, repeats, value
 
     def changes(self, path: Path, after: int, until: int = 2**63 - 1) -> Iterator[tuple[int, Any]]:
         """Yield the instants (ns) of news on a full path, and what was there, MISSING if nothing was."""
-        for ns, repeats, tree in self.following(path, after, until):
+        for refs, repeats, tree in self.following(path, after, until):
             if not repeats:
-                yield ns, tree
+                yield refs[0].time, tree
 
     def published_at(self, path: Path, ns: int) -> int:
         """Return when the news on a path of an instant was published (ns), or that instant if it was not."""
@@ -294,6 +294,11 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         channels = [channel for channel, stream in self.of_channel.items() if stream.role == role]
         for ref in self.timeline.between(channels, -1, 2**63 - 1):
             yield ref, self.of_channel[ref.channel]
+
+    def published(self, refs: Iterable[Ref]) -> int | None:
+        """Return when the news of one instant was published (ns), on its publisher's clock; None if it was not."""
+        published = (ref for ref in refs if self.of_channel[ref.channel].kind == Kind.PUBLISHED)
+        return next((self.stamp(ref)[0] for ref in published), None)
 
     def stamp(self, ref: Ref) -> tuple[int, int]:
         """Return when a message was published (ns), and its number."""

@@ -18,6 +18,7 @@ from ...plan.raw import LARGEST
 from ...plan.trees import MISSING
 from ...pubsub.raw_watch import RawUpdate, RawWatch
 from ...session import Session
+from .blackbox import BlackBox
 from .format import Kind, Role
 from .stored import pruned
 from .times import Clock
@@ -34,7 +35,7 @@ class Owner(Protocol):
     """What is needed of the recorder, which imports this module."""
 
     session: Session
-    writer_thread: WriterThread
+    writer_thread: WriterThread | BlackBox
     clock: Clock
     patterns: list[Pattern]
 

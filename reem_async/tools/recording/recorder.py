@@ -21,13 +21,15 @@ from ...concurrency.queues import Last
 from ...concurrency.streams import arrived
 from ...concurrency.tasks import give_way
 from ...connection import RedisInterface
-from ...errors import BadValue, InterfaceClosed, RedisError
+from ...coordination.clock import ServerClock
+from ...errors import BadValue, InterfaceClosed, Misuse, RedisError
 from ...plan.arguments import check_instance, check_number
 from ...plan.paths import parse_patterns
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from ...pubsub.refresh import find_regularly
 from ...session import Session
+from .blackbox import BlackBox
 from .format import RecordingFailed
 from .key_recorder import RecordedKeys
 from .output import FileGone
@@ -35,7 +37,7 @@ from .raw_keys import RawRecorder
 from .sample import Sample, Sampler, samples_of
 from .sink import Sink
 from .times import PATIENCE, Arrivals, Clock
-from .writer_thread import WriterThread
+from .writer_thread import Operation, WriterThread
 
 # Seconds between looks at keyframes that are due, the disk, and keys that must be read again.
 _TICK = 0.1
@@ -43,6 +45,7 @@ _TICK = 0.1
 _WAITING = 50_000
 # Large values that are fetched at the same time: more would not be faster, and be more memory.
 _FETCHES = 8
+_CLOCK_READINGS = 4  # round trips
 _PATIENCE = 3.0
 """Seconds in which what was announced before the end is still fetched."""
 
@@ -53,10 +56,11 @@ class RecorderStatus:
 
     Attributes:
         seconds: Since it began.
-        messages: Written.
-        bytes: Written, before compression.
+        messages: Written; of a black box, in memory.
+        bytes: Written, before compression; of a black box, in memory.
         file_bytes: In the file.
-        dropped: Updates left out since the disk or this program could not keep up.
+        dropped: Updates left out since the disk or this program could not keep up; of a black box, that went before
+            their time since it may not take more memory.
         skipped: Updates that were announced, and that a newer one replaced, or changed inside, before they could be
             fetched: what they wrote cannot be had any more.
         gaps: How often updates were lost on the way from the server.
@@ -64,6 +68,8 @@ class RecorderStatus:
         late: Readings of samples left out since the ones before took too long.
         failed: Readings of samples that failed: what is there cannot be read, or the server did not answer.
         rate: Messages a second, on average.
+        clock_steps: How often the publisher's times of a key went back by over 10 ms: its clock was set, or another
+            program with another clock publishes it.
     """
 
     seconds: float
@@ -77,6 +83,7 @@ class RecorderStatus:
     late: int
     failed: int
     rate: float
+    clock_steps: int
 
 
 class Recorder:
@@ -105,6 +112,9 @@ class Recorder:
         overwrite: Replace the file if it exists; it stays as it is until recording has begun.
         compression: "zstd", "lz4" or "none".
         queue_bytes: What may wait for the disk.
+        last: A black box: so many seconds are kept in memory, and there is no file but by `save`. `path` is not used.
+        memory: Bytes that these may take, with what each key held before them. The oldest go before their time if they
+            would take more, which `status.dropped` counts. Plain values that the keys hold are kept whatever they take.
 
     Raises:
         BadValue: The file exists, is being recorded or cannot be made, or an argument that means nothing.
@@ -122,10 +132,15 @@ class Recorder:
         overwrite: bool = False,
         compression: str = "zstd",
         queue_bytes: int = 256 << 20,
+        last: float | None = None,
+        memory: int = 256 << 20,
     ) -> None:
         check_number("keyframe", keyframe, "use seconds, over 0", above=0)
         check_number("queue_bytes", queue_bytes, "use a number of bytes, 1 or more", least=1)
+        check_number("memory", memory, "use a number of bytes, 1 or more", least=1)
         check_instance("path", path, (str, FilePath), "use the name of a file")
+        if last is not None:
+            check_number("last", last, "use seconds, over 0, or None for a file", above=0)
         self.path = FilePath(path)
         self.patterns = parse_patterns(patterns)
         self.session = interface.session.raw  # pictures go into the file as they are
@@ -156,9 +171,21 @@ class Recorder:
         self._dropped = 0
         self._failure: Exception | None = None
         self._done = asyncio.Event()
-        described = description(self.session, patterns, self._samples, keyframe)
-        self._sink = Sink(self.path, compression, described, overwrite=overwrite)
-        self.writer_thread = WriterThread(self._sink, self.session.ships, queue_bytes, self.patterns)
+        self._compression, self._queue_bytes = compression, queue_bytes
+        self._described = description(self.session, patterns, self._samples, keyframe)
+        self._box = None if last is None else BlackBox(last, memory)
+        self._sink: Sink | None = None
+        if self._box is None:
+            self._sink = self._sink_of(self.path, overwrite=overwrite)
+            self.writer_thread: WriterThread | BlackBox = self._writer_to(self._sink)
+        else:
+            self.writer_thread = self._box
+
+    def _sink_of(self, path: FilePath, *, overwrite: bool, whole: bool = False) -> Sink:
+        return Sink(path, self._compression, self._described, overwrite=overwrite, whole=whole)
+
+    def _writer_to(self, sink: Sink, first: Sequence[Operation] = ()) -> WriterThread:
+        return WriterThread(sink, self.session.ships, self._queue_bytes, self.patterns, first)
 
     # Lifetime.
 
@@ -168,9 +195,12 @@ class Recorder:
         One round trip for each pattern, one or two for each key. If it fails or is cancelled, there is no file, or
         the one that was to be replaced is still there.
         """
-        self.writer_thread.start()
         self._begun = time.monotonic()
         try:
+            self._described |= (clocks := await self._clocks())
+            if self._sink is not None:
+                self._sink.describe(clocks)
+            self.writer_thread.start()
             if self._monitor is not None:
                 await self._monitor.listen()
                 await self._monitor.watch_changes()
@@ -185,10 +215,18 @@ class Recorder:
             self._sampler.start()
             self._begin(self._tick)
             self._check()
-            self._sink.output.appear()
+            if self._sink is not None:
+                self._sink.output.appear()
         except BaseException:
             await self._end()
             raise
+
+    async def _clocks(self) -> dict[str, str]:
+        """Return what is noted of this computer's clock and the server's, which publishers measure, too."""
+        found = await ServerClock(self.session).known(0.0, _CLOCK_READINGS)
+        if found is None:
+            return {"clock offset": "unknown: the server did not say, or this user may not ask (TIME)"}
+        return {"clock offset": f"{found.offset:.6f}", "clock bound": f"{found.bound:.6f}"}
 
     def _begin(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Start a task; if it fails, the recording ends."""
@@ -208,16 +246,68 @@ class Recorder:
             RecordingFailed: Writing ended before, for want of space or another reason.
         """
         if self._begun and not self._ended:
-            with contextlib.suppress(RedisError, OSError):  # no connection: what has arrived is all there is
-                await self.fence()
-            self._pump()
-            await self._keys.settled(_PATIENCE)
-            await self._raw.settled(_PATIENCE)
+            await self._catch_up_to_now()
             await self._look_once_more()
             await self._complete(time.monotonic() + _PATIENCE)
             self._keyframe_of_all()
         await self._end()
         self._check()
+
+    async def save(self, path: str | FilePath, after: float = 0.0, *, overwrite: bool = False) -> FilePath:
+        """Write what a black box (`last`) has in memory, and what follows for `after` seconds; return the path.
+
+        The file is the one of a recorder that had begun `last` seconds ago. It gets its name once it is whole. If it
+        cannot be written, or this is cancelled, nothing is left of it, and the box goes on as before. Several may be
+        saved at a time.
+
+        Args:
+            path: The file; it must not exist.
+            after: Seconds.
+            overwrite: Replace the file if it exists.
+
+        Raises:
+            BadValue: The file exists or cannot be made, or `after` is no number of seconds.
+            Misuse: The recorder has no `last`, or does not record now.
+            RecordingFailed: The disk is full, or the like.
+        """
+        check_number("after", after, "use seconds, 0 or more")
+        check_instance("path", path, (str, FilePath), "use the name of a file")
+        if self._box is None or not self._begun or self._ended:
+            raise Misuse("save() is of a recorder with last=, between start() and stop()")
+        sink = self._sink_of(FilePath(path), overwrite=overwrite, whole=True)
+        try:
+            await self._catch_up_to_now()
+            writer = self._writer_to(sink, self._box.operations())
+        except BaseException:
+            sink.close()
+            raise
+        writer.start()
+        self._box.saves.append(writer)
+        try:
+            end = time.monotonic() + after
+            while (left := end - time.monotonic()) > 0 and writer.failure is None and not self._done.is_set():
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._done.wait(), min(_TICK, left))
+            if after:
+                await self._catch_up_to_now()
+        except BaseException:
+            sink.whole = False
+            raise
+        finally:
+            self._box.saves.remove(writer)
+            await _uninterrupted(asyncio.to_thread(writer.stop, self._ended_metadata()))
+        if writer.failure is not None:
+            reason = _reason(writer.failure)
+            raise RecordingFailed(f"{path} could not be saved ({reason}); nothing is left of it") from writer.failure
+        return sink.path
+
+    async def _catch_up_to_now(self) -> None:
+        """Take what was published until now, as far as the server answers."""
+        with contextlib.suppress(RedisError, OSError):  # no connection: what has arrived is all there is
+            await self.fence()
+        self._pump()
+        await self._keys.settled(_PATIENCE)
+        await self._raw.settled(_PATIENCE)
 
     async def _end(self) -> None:
         self._ended = self._ended or time.monotonic()
@@ -231,9 +321,14 @@ class Recorder:
             await self._raw.stop()
             if self._monitor is not None:
                 await self._monitor.close()
+        if self._box is not None:  # they end soon, since this is done
+            await self._box.saved()
+        await asyncio.to_thread(self.writer_thread.stop, self._ended_metadata())
+
+    def _ended_metadata(self) -> dict[str, str]:
         ended = {"ended": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "seconds": f"{self.status.seconds:.3f}"}
         late = {"samples late": str(self._sampler.late), "samples failed": str(self._sampler.failed)}
-        await asyncio.to_thread(self.writer_thread.stop, ended | (late if self._samples else {}))
+        return ended | (late if self._samples else {})
 
     async def wait(self, seconds: float | None = None) -> None:
         """Return after so many seconds, or never; raises RecordingFailed as soon as it cannot go on."""
@@ -247,7 +342,7 @@ class Recorder:
     def _check(self) -> None:
         failure = self.writer_thread.failure or self._failure
         if failure is not None:
-            reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else repr(failure)
+            reason = _reason(failure)
             left = "" if isinstance(failure, FileGone) else "; what is in the file by now can be read"
             raise RecordingFailed(f"{self.path} could not be written any further ({reason}){left}") from failure
 
@@ -273,9 +368,9 @@ class Recorder:
         seconds = max(now - self._begun, 0.0) if self._begun else 0.0
         return RecorderStatus(
             seconds,
-            counts.messages,
-            counts.bytes,
-            self._sink.output.tell(),
+            counts.messages if self._box is None else self._box.messages,
+            counts.bytes if self._box is None else self._box.bytes,
+            0 if self._sink is None else self._sink.output.tell(),
             counts.dropped,
             counts.skipped,
             counts.gaps,
@@ -283,6 +378,7 @@ class Recorder:
             self._sampler.late,
             self._sampler.failed,
             counts.messages / seconds if seconds else 0.0,
+            counts.clock_steps,
         )
 
     # What comes in.
@@ -389,6 +485,20 @@ class Recorder:
         self._keyframes += 1
         self._keys.keyframe(self._keyframes)
         self._raw.keyframe(self._keyframes)
+
+
+def _reason(failure: Exception) -> str:
+    return failure.strerror if isinstance(failure, OSError) and failure.strerror else repr(failure)
+
+
+async def _uninterrupted(work: Coroutine[Any, Any, None]) -> None:
+    """Wait for work to its end, also if this task is cancelled meanwhile."""
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await task
+        raise
 
 
 def description(

@@ -58,16 +58,20 @@ class Sink:
     Raises BadValue if the file is there already or cannot be made, and RecordingFailed if it cannot be written.
     """
 
-    def __init__(self, path: FilePath, compression: str, metadata: Mapping[str, str], *, overwrite: bool) -> None:
+    def __init__(
+        self, path: FilePath, compression: str, metadata: Mapping[str, str], *, overwrite: bool, whole: bool = False
+    ) -> None:
         if compression not in tuple(COMPRESSIONS):  # not hashed: it may be anything
             raise BadValue(f"compression {compression!r:.60} is none of {', '.join(COMPRESSIONS)}")
+        self.path = path
         self.output = Output(path, overwrite=overwrite)
         try:
             self._writer = McapWriter(self.output, compression, f"reem/{metadata.get('version', '')}")
-            self._writer.add_metadata("reem", dict(metadata))
+            self.describe(metadata)
             self.output.flush()
         except OSError as error:
             raise RecordingFailed(f"{path} cannot be written: {error.strerror}") from error
+        self.whole = whole  # it gets its name when it is finished, or never
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[Any, int] = {}
         self._known: dict[Any, list[tuple[Schema, int]]] = {}
@@ -76,6 +80,10 @@ class Sink:
         # When the last chunk was closed, and how many messages wait in the open one.
         self._closed_at = time.monotonic()
         self._open = 0
+
+    def describe(self, metadata: Mapping[str, str]) -> None:
+        """Say more of the recording as a whole."""
+        self._writer.add_metadata("reem", metadata)
 
     def json(self, path: Path, role: Role, kind: Kind, document: JsonMessage, stamp: tuple[int, int, int]) -> int:
         """Write a JSON message; returns its bytes. `stamp` is log time and publish time in ns, and a number."""
@@ -159,8 +167,10 @@ class Sink:
         """Write the last chunk, what is said of the recording at its end, and the index; close the file."""
         self._writer.flush()
         self._list_channels()
-        self._writer.add_metadata("reem", dict(metadata))
+        self.describe(metadata)
         self._writer.finish()
+        if self.whole:
+            self.output.appear()
         self.close()
 
     def close(self) -> None:

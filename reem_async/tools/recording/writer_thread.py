@@ -11,10 +11,12 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
+import orjson
 
 from ...concurrency.tasks import give_way
 from ...plan.paths import Path, Pattern, show
@@ -46,7 +48,7 @@ logger = logging.getLogger("reem.recording")
 _BATCH_SECONDS = 0.04
 # Added to the thread's niceness: it may lag behind, the recorded programs may not.
 _NICER = 10
-_LARGE = (Role.UPDATE, Role.DELETE, Role.STATE, Role.STORED)
+LARGE = (Role.UPDATE, Role.DELETE, Role.STATE, Role.STORED)
 """Roles that are dropped if the queue is full; the others hold nothing."""
 _HURRY = 1 << 20
 """Bytes in the queue from which the thread is woken at once."""
@@ -61,6 +63,15 @@ class Operation(NamedTuple):
     stamp: tuple[int, int, int]  # log time and publish time in ns, and a number
     kind: Kind = Kind.PUBLISHED
 
+    def loaded(self) -> Operation:
+        return self._replace(value=orjson.loads(self.value.text)) if type(self.value) is Packed else self
+
+
+class Packed(NamedTuple):
+    """A plain value as JSON, which takes less memory."""
+
+    text: bytes
+
 
 class Counts:
     def __init__(self) -> None:
@@ -70,6 +81,7 @@ class Counts:
         self.skipped = 0
         self.gaps = 0
         self.lost = 0
+        self.clock_steps = 0
         self.by_path: collections.Counter[str] = collections.Counter()
 
     def drop(self, path: Path) -> None:
@@ -94,7 +106,14 @@ class Counts:
 class WriterThread:
     """Writes operations to a file on a thread of its own; at most `limit` bytes wait."""
 
-    def __init__(self, sink: Sink, ships: Ships, limit: int, patterns: Sequence[Pattern] = ()) -> None:
+    def __init__(
+        self,
+        sink: Sink,
+        ships: Ships,
+        limit: int,
+        patterns: Sequence[Pattern] = (),
+        first: Iterable[Operation] = (),  # are written before all others, and take no room
+    ) -> None:
         self.counts = Counts()
         self.failure: Exception | None = None
         self.behind: set[str] = set()  # keys to read again: the tree here is not what the server has
@@ -103,7 +122,7 @@ class WriterThread:
         self._sink = sink
         self._ships = ships
         self._limit = limit
-        self._queue: collections.deque[tuple[Operation, int]] = collections.deque()
+        self._queue = collections.deque((operation, 0) for operation in first)
         self._size = 0
         # Guards the queue and its size. The event loop holds it for a few steps only, never while something is written.
         self._changed = threading.Condition()
@@ -134,7 +153,7 @@ class WriterThread:
                 return False
             # Gaps and skips always fit: they matter most when the disk is slow. One
             # operation fits into an empty queue whatever its size.
-            if operation.role in _LARGE and self._size and self._size + size > self._limit:
+            if operation.role in LARGE and self._size and self._size + size > self._limit:
                 self.counts.drop(operation.path)
                 # The tree lacks this update, so the key has to be read again.
                 self.behind.add(name)
@@ -160,6 +179,8 @@ class WriterThread:
             self._changed.notify()
         if self._thread.is_alive():
             self._thread.join()
+        else:
+            self._sink.close()  # it was never started
 
     def _run(self) -> None:
         with contextlib.suppress(OSError):  # it must never keep the recorded programs waiting
@@ -183,7 +204,7 @@ class WriterThread:
 
     def _summary(self) -> dict[str, str]:
         counts = self.counts
-        names = ("messages", "bytes", "dropped", "skipped", "gaps", "lost")
+        names = ("messages", "bytes", "dropped", "skipped", "gaps", "lost", "clock_steps")
         figures = {name: str(getattr(counts, name)) for name in names}
         return figures | {f"not recorded: {path}": str(number) for path, number in counts.by_path.most_common(100)}
 
@@ -198,7 +219,7 @@ class WriterThread:
                 if not self._queue:
                     return ending
                 operation, size = self._queue.popleft()
-            self._write(operation)
+            self._write(operation.loaded())
             # Else a frame would stay in memory while the next one is waited for.
             del operation
             give_way()
@@ -385,6 +406,15 @@ class WriterThread:
     def _count(self, size: int) -> None:
         self.counts.messages += 1
         self.counts.bytes += size
+
+
+def write_recording(path: FilePath, operations: Iterable[Operation], ships: Ships, metadata: Mapping[str, str]) -> None:
+    """Write operations into a file, which appears when it is whole; raises OSError, BadValue or RecordingFailed."""
+    writer = WriterThread(Sink(path, "zstd", metadata, overwrite=False, whole=True), ships, 0, first=operations)
+    writer.start()
+    writer.stop({})
+    if writer.failure is not None:
+        raise writer.failure
 
 
 def _as_state(it: Operation) -> Operation:

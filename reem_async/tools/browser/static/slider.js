@@ -22,6 +22,7 @@ export class TimeBar {
     this.slider.addEventListener("input", () => this.onInput());
     this.live.addEventListener("click", () => { this.pause(); app.seek(null); });
     this.play.addEventListener("click", () => this.toggle());
+    find("save").hidden = !app.config.live;
     find("back").addEventListener("click", () => this.step(-STEP));
     find("forth").addEventListener("click", () => this.step(STEP));
     new ResizeObserver(() => this.drawActivity()).observe(this.canvas);
