@@ -175,6 +175,8 @@ def test_the_command_saves_at_ctrl_c(key, server_url, pspace, tmp_path):
     assert (process.returncode, out[:16], errors) == (0, "saved crash.mcap", "")
     with open_log(tmp_path / "crash.mcap") as log:
         assert log[key("arm")]["n"].at(log.end) == 7
+    again = finished("record", "--last", "60", "-o", str(tmp_path / "crash.mcap"), REEM_URL=server_url)
+    assert (again.returncode, "is there already" in again.stderr) == (2, True)
 
 
 def test_on_needs_last(server_url, tmp_path):

@@ -20,6 +20,7 @@ from ...coordination.services import CALLS
 from ...errors import BadValue, RedisError, ReemError
 from ...store.store import KeyValueStore
 from ...transport.options import look_nearby
+from ..partfile import there_already
 from .following import progress
 from .options import DEFAULT_URL, AsJson, Force, Namespace, Patterns, Ships, Url, existing, named_ships
 from .output import clean, emit, emit_json, figures, note, size_text
@@ -117,6 +118,8 @@ def record(
         look_nearby(interface.session.options)
         if output == Path("-"):
             raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
+        if last is not None and output.exists() and not force:  # not only once there is something to be written
+            raise BadValue(str(there_already(output)))
         # Refused here if the file is there already: nothing was sent for it yet.
         recorder = Recorder(
             *(interface, wanted, output),
@@ -222,7 +225,10 @@ class _Box:
         name = str(self._output).replace("{time}", time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()))
         try:
             path = await self._recorder.save(name, after, overwrite=self._force)
-        except ReemError as error:  # the next one may be written
+        except ReemError as error:
+            if self._on is None:
+                raise
+            # The next one may be written.
             note(f"not saved: {error}")
             return
         size = path.stat().st_size
