@@ -148,7 +148,7 @@ class BlackBox:
             if _content(it) < _NODE:
                 return it
             self.counts.lose(path)
-            return Unreadable(show(path), f"not kept: the black box may take {self._memory} bytes (memory=)")
+            return Unreadable(show(path), f"not kept: the black box may take {self._memory} bytes")
 
         return mapped(value, strip)
 

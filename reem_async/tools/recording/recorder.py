@@ -273,7 +273,7 @@ class Recorder:
         check_number("after", after, "use seconds, 0 or more")
         check_instance("path", path, (str, FilePath), "use the name of a file")
         if self._box is None or not self._begun or self._ended:
-            raise Misuse("save() is of a recorder with last=, between start() and stop()")
+            raise Misuse("save() needs a recorder that keeps the last seconds, between start() and stop()")
         sink = self._sink_of(FilePath(path), overwrite=overwrite, whole=True)
         try:
             await self._catch_up_to_now()
