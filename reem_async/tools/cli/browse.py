@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ...concurrency.tasks import stand_back
 from ...connection import RedisInterface
 from ...errors import ServerFailed
 from ...server import EmbeddedServer
@@ -121,8 +120,6 @@ async def _serve(source: Source, host: str, port: int, allow_write: bool, open_:
         _tell(source, address, alone, allow_write)
         if open_:
             open_page(address)
-        with suppress(AttributeError, OSError):
-            stand_back()  # not before the web browser, which would inherit it
         await PageServer(app, sock).run_until_stopped()
     finally:
         sock.close()
