@@ -146,8 +146,10 @@ class Proxy:
         self.port = listening.getsockname()[1]
         self._ready.set()
         await self._over.wait()
+        self._loop.remove_reader(listening)
+        for _ in range(5):  # what was accepted before gets to `connected` first: a closed server would drop it unclosed
+            await asyncio.sleep(0)
         server.close()
-        await asyncio.sleep(0)  # for connections that were accepted before, and are on their way to `connected`
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
