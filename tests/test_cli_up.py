@@ -169,6 +169,7 @@ def test_it_shows_a_server_until_it_is_stopped(server_url, kvs, key, number):
             assert events.status_code == 200  # an open page must not hold up the end
             answer = httpx.get(f"{address}api/node", params={"path": f"{key()}.x"}, timeout=PATIENCE, trust_env=False)
             assert answer.json()["text"] == "5"
+            assert os.getpriority(os.PRIO_PROCESS, process.pid) == 19  # the robot's programs come first
             refused = httpx.post(f"{address}api/write", json={}, timeout=PATIENCE, trust_env=False)
             assert "--allow-write" in refused.json()["error"]
             process.send_signal(number)

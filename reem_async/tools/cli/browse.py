@@ -120,6 +120,8 @@ async def _serve(source: Source, host: str, port: int, allow_write: bool, open_:
         _tell(source, address, alone, allow_write)
         if open_:
             open_page(address)
+        with suppress(AttributeError, OSError):
+            os.nice(19)  # a robot's programs come first; not before the web browser is opened, which would inherit it
         await PageServer(app, sock).run_until_stopped()
     finally:
         sock.close()
