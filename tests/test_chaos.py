@@ -16,6 +16,9 @@ SEED = int(os.environ.get("REEM_TEST_SEED", time.time_ns() % 10**9))
 @pytest.mark.alone
 @pytest.mark.parametrize("number", sorted(ROWS), ids=lambda number: f"row {number}")
 def test_a_row_of_the_scoreboard(number):
+    """Every figure is within its bound, and the load was real."""
     outcome = run(number, "quick", SEED)
+    if outcome.status == "NOT RUN":
+        pytest.skip("; ".join(outcome.figures))
     said = "\n".join([*outcome.failures, *outcome.figures, f"again: {outcome.replay}", outcome.output[-4000:]])
     assert outcome.status == "PASS", said

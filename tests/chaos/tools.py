@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +18,8 @@ from slotkit import shared_in
 
 import reem_async
 from reem_async.local import LEAST
+
+from .scoreboard import ROOT
 
 PAUSE = 0.005
 """Seconds between two looks at a condition."""
@@ -38,6 +43,12 @@ def descriptors() -> tuple[int, int]:
             else:
                 others += 1
     return others, shared
+
+
+def quantile(values: list[float], part: float) -> float:
+    """The value that `part` of the values do not exceed."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(part * len(ordered)))]
 
 
 async def became(condition: Callable[[], Any], seconds: float) -> float | None:
@@ -67,11 +78,49 @@ async def background(*coroutines: Any):
 
 @contextlib.contextmanager
 def measured(times: list[float]) -> Iterator[None]:
+    """Add to `times` the seconds that the block takes, however it ends."""
     begun = time.perf_counter()
     try:
         yield
     finally:
         times.append(time.perf_counter() - begun)
+
+
+@contextlib.contextmanager
+def program(name: str, *arguments: Any):
+    """Start one of the programs; both ways of talking to it are pipes."""
+    command = [sys.executable, "-W", "error", "-m", "tests.chaos.programs", name, *map(str, arguments)]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def said(process: subprocess.Popen[str]) -> dict[str, Any]:
+    line = process.stdout.readline()
+    assert line, f"the program ended with {process.wait(5)}"
+    return json.loads(line)
+
+
+def order(process: subprocess.Popen[str], word: object) -> None:
+    process.stdin.write(f"{word}\n")
+    process.stdin.flush()
+
+
+def say(**facts: Any) -> None:
+    """Tell the row: what a program does."""
+    print(json.dumps(facts), flush=True)
+
+
+def heard() -> str:
+    """Wait for the row's next word: what a program does."""
+    return sys.stdin.readline().strip()
 
 
 class Log:
