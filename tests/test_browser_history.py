@@ -198,4 +198,4 @@ def test_what_was_announced_and_then_found_is_one_change(history):
         history.add(("cam", "image"), when, 8, when + 0.1, answer=True)
     assert history.times(("cam", "image")) == [9.0, 10.0, 10.5]
     assert history.times(()) == [9.0, 10.0, 10.5]
-    assert history.rate("cam", 11.0, over=1.5) == pytest.approx(2 / 1.5)
+    assert history.rate("cam", 14.5) == pytest.approx(2 / 5)  # two in the last five seconds

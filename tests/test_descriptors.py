@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import copy
 import dataclasses
 import gc
@@ -44,7 +45,8 @@ def test_a_copy_of_what_follows_or_waits_closes_no_descriptor(interface, key, wa
     kvs[key()] = 1
     watch, states = kvs[key()].watch(), interface.states()
     next(watch), next(states)
-    watch._core.queue._wakeup(), states._core.queue._wakeup()  # as a thread that waits makes them
+    for each in (watch, states):  # as a thread that has waited leaves it
+        each._core.queue._idle.setdefault(os.getpid(), collections.deque()).append(wakeups())
     callback = reem.CallbackSubscriber(key(), interface, lambda data, updated_path: heard.append(data))
     callback.listen()
     with kvs[key()].mirror() as mirror:

@@ -365,13 +365,15 @@ asyncio.run(main(*sys.argv[1:]))
 """
 
 
-def test_killed_with_9_all_but_the_last_second_is_there(key, server_url, pspace, tmp_path):
+# Beside other tests the writing thread, which is nicer than other programs, may not get the processor in time.
+@pytest.mark.parametrize("seconds", [2.0, pytest.param(1.0, marks=pytest.mark.alone)])
+def test_killed_with_9_all_but_the_last_second_is_there(key, server_url, pspace, tmp_path, seconds):
     file, sent = tmp_path / "run.mcap", []
     process = python(RECORD, server_url, key("*"), file, start=True)
     try:
         assert process.stdout.readline() == "up\n", process.stderr.read()
         begun = time.monotonic()
-        while time.monotonic() - begun < 3.0:
+        while time.monotonic() - begun < seconds + 2.0:
             value = {"n": len(sent), "image": IMAGE + np.uint8(len(sent) % 256)} if len(sent) % 10 == 0 else len(sent)
             sent.append((time.time(), value))
             pspace[key("a" if len(sent) % 10 == 1 else "n")] = value
@@ -382,13 +384,13 @@ def test_killed_with_9_all_but_the_last_second_is_there(key, server_url, pspace,
         process.communicate()
     with open_log(file) as log:
         assert not log.indexed
-        old = [(instant, value) for instant, value in sent if instant < killed - 1.0]
+        old = [(instant, value) for instant, value in sent if instant < killed - seconds]
         assert len(old) > 100
         assert (
             log[key("n")].history()[1].tolist()[: len(old) // 2]
             == [value for _, value in sent if type(value) is int][: len(old) // 2]
         )
-        assert log.end > killed - 1.0
+        assert log.end > killed - seconds
         newest = max((value for instant, value in old if type(value) is int))
         assert log[key("n")].at(log.end) >= newest
         known = {value["n"]: value for _, value in sent if type(value) is dict}

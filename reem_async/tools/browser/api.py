@@ -371,16 +371,17 @@ class Events:
             raise RefusedRequest(503, f"{_MOST_CLIENTS} pages are open already; close some")
         # The second keeps a proxy (nginx) from collecting events before it passes them on.
         headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
-        return StreamingResponse(self._stream(), headers=headers, media_type="text/event-stream")
+        return StreamingResponse(self._stream(request), headers=headers, media_type="text/event-stream")
 
-    async def _stream(self) -> AsyncIterator[bytes]:
+    async def _stream(self, request: Request) -> AsyncIterator[bytes]:
         self._clients += 1
         self._source.shown_on(self._clients)
         try:
             # Milliseconds until a browser that lost the connection tries again.
             yield b"retry: 1000\n\n"
             told, quiet, before = self._source.status().end, 0.0, ""
-            while not self._ending():
+            # Not all versions of uvicorn end the response of a page that has gone.
+            while not self._ending() and not await request.is_disconnected():
                 status = self._source.status()
                 paths = await self._source.changes(told, status.end, _MOST_PATHS)
                 if paths or status.lost != before or quiet >= _QUIET:

@@ -86,6 +86,7 @@ def export(
     clock: Annotated[
         str,
         typer.Option(
+            "--clock",  # typer 0.27.0 takes a metavar that is the name for the option itself
             metavar="CLOCK",
             rich_help_panel=_TRAINING,
             help="Whose times count: recorder, or publisher, where all publishers have clocks that agree.",
