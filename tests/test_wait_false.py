@@ -520,13 +520,14 @@ def test_an_update_that_found_no_server_keeps_its_number(publisher, server, read
         front.flush()
         proxy.black_hole()
         proxy.reset()
+        front.sleep(0.1)  # until the reset has arrived: what is sent before it may have been applied
         front.write(["a"], 2)
         front.sleep(0.5)
         proxy.heal()
         front.flush()
         front.write(["a"], 3)
         front.flush()
-        updates = [next(watch) for _ in range(3)]
+        updates = [watch.next(PATIENCE) for _ in range(3)]
         assert [(update.data, update.sequence, update.missed) for update in updates] == [(n, n, 0) for n in (1, 2, 3)]
         assert len({update.publisher for update in updates}) == 1
 

@@ -146,7 +146,9 @@ class SendQueue(Outage):
 
     @property
     def _is_full(self) -> bool:
-        return sum([len(out.kept) for out in list(self._out.values())]) > MOST_CALLS or super()._is_full
+        # One that is being sent is not counted, and more that share its transaction are.
+        waiting = [len(out.kept) + max(out.sending - 1, 0) for out in list(self._out.values())]
+        return sum(waiting) > MOST_CALLS or super()._is_full
 
     async def _wake(self) -> None:
         if self._is_idle:
