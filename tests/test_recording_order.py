@@ -7,8 +7,10 @@ import time
 
 import numpy as np
 import pytest
-from conftest import PATIENCE, Remembering, aeventually, assert_same
+import redis
+from conftest import PATIENCE, Remembering, aeventually, assert_same, url_of_user
 
+import reem
 import reem_async
 from reem_async.pubsub.monitor import Event
 from reem_async.tools.recording import Recorder, Replayer, open_log
@@ -96,17 +98,19 @@ async def test_a_key_that_is_gone_was_not_deleted_by_a_publisher(key, apspace, a
 
 
 @pytest.mark.alone
-async def test_a_key_that_cannot_be_read_is_told_of_once(key, raw, binterface, file, caplog):
-    raw.set(key(), "no document")
+async def test_a_key_that_cannot_be_read_is_told_of_once(key, raw, server, file, caplog):
+    with redis.Redis.from_url(server.url) as client, reem.RedisInterface(server.url) as owner:
+        reem.KeyValueStore(owner)[key()] = {"x": 1}
+        client.execute_command("ACL", "SETUSER", "guest", "on", ">pw", "~other*", "&*", "+@all")
+    url = url_of_user(server.url, "guest", "pw")
     begun = time.monotonic()
-    async with Recorder(binterface, [key()], file, keyframe=0.1) as recorder:
+    async with reem_async.RedisInterface(url) as guest, Recorder(guest, [key()], file, keyframe=0.1) as recorder:
         await asyncio.sleep(0.5)
     assert time.monotonic() - begun < 3
     assert len([record for record in caplog.records if "not recorded" in record.message]) == 1
     assert recorder.status.lost == 1
     with open_log(file) as log:
         assert log.metadata[f"not recorded: {key()}"] == "1"
-    raw.delete(key())
 
 
 async def test_numbers_of_a_long_list_are_updated(key, apspace, akvs, binterface, file, tmp_path):
