@@ -30,12 +30,17 @@ def test_the_slider_of_a_robot_with_two_cameras_has_a_picture_for_each_instant(s
     """
     seconds = int(os.environ.get("REEM_TEST_SLIDER", "5"))
     make = lambda: LiveSource(RedisInterface(server_url), seconds, DEFAULT_BUDGET * seconds // DEFAULT_SECONDS)  # noqa: E731
-    with served(make) as (address, source), running_robot(server_url, key()), client_of(address) as ask:
+    with (
+        served(make) as (address, source),
+        running_robot(server_url, key()),
+        client_of(address) as ask,
+        client_of(address) as page,
+        page.http.stream("GET", "/api/events"),  # as an open page does: else arrays are read less often
+    ):
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline and key() not in ask.rows():
             time.sleep(0.1)
-        with ask.http.stream("GET", "/api/events"):  # as an open page does: else arrays are read less often
-            time.sleep(seconds + 1.5)
+        time.sleep(seconds + 1.5)
         for name in ("camera", "depth"):
             span = ask.json("tree", open="1:0:")
             answers = look_back(ask, f"{key()}.{name}.image", span["start"] + 1, span["end"], 31)
