@@ -1,5 +1,6 @@
 """Clocks: the offset to the server's, and the publisher's times in recordings."""
 
+import re
 import time
 from types import SimpleNamespace
 
@@ -63,7 +64,8 @@ async def test_a_recording_has_the_publishers_times_and_counts_where_they_go_bac
         await akvs[name]["q"].write(99)  # only stored: no publisher
         await aeventually(lambda: recorder.status.messages > len(shifts))
         assert recorder.status.clock_steps == 1
-    assert [f"{name}: the publisher's time went back by 361" in text for text in caplog.messages] == [True]
+    (warning,) = caplog.messages
+    assert re.match(f"{name}: the publisher's time went back by 36(09|10)", warning), warning
     with open_log(file) as log:
         received, all_values = log[name]["q"].history()
         published, values = log[name]["q"].history(clock="publisher")

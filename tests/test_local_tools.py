@@ -4,6 +4,7 @@ import asyncio
 import json
 import os
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -40,6 +41,16 @@ def local_finding(url, *words, namespace=""):
     return row
 
 
+async def followed_here(apspace, name):
+    """Publish until it is known that a program of this host listens: in a cluster a new key is found in a moment."""
+    session = apspace.interface.session
+    deadline = time.monotonic() + PATIENCE
+    while not session.local.audience(session.keys(name)):
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.1)
+        await apspace[name].write(IMAGE)
+
+
 @only_where_there_is
 async def test_a_recorder_takes_frames_from_memory_which_the_server_has_lost_by_then(key, apspace, binterface, file):
     """Frames that come so fast that each is replaced before a read of it could be sent."""
@@ -47,6 +58,7 @@ async def test_a_recorder_takes_frames_from_memory_which_the_server_has_lost_by_
     async with Recorder(binterface, [key("*")], file) as recorder:
         await apspace[key("cam")].write(IMAGE)  # asks for subscribers on this host
         await aeventually(lambda: recorder.status.messages > 0)
+        await followed_here(apspace, key("cam"))
         await asyncio.gather(*[apspace[key("cam")].write(frame) for frame in frames])
         await recorder.fence()
         assert recorder.status.skipped == 0
