@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import orjson
 import pytest
+from chaos.proxy import Proxy
 from conftest import (
     PATIENCE,
     RawCluster,
@@ -185,6 +186,22 @@ def test_serving_needs_a_running_loop_or_a_plain_function(server_url, kvs, key):
         kvs[key()].serve(asyncio.sleep)
 
 
+async def test_no_call_goes_to_a_service_that_is_closing_or_closed(server, key):
+    """Its connection is slow, that of the caller is not: a request may be on its way when the service closes."""
+    with Proxy(server.port) as proxy:
+        async with reem_async.RedisInterface(proxy.url) as far, reem_async.RedisInterface(server) as near:
+            place = reem_async.KeyValueStore(near)[key()]
+            async with reem_async.KeyValueStore(far)[key()].serve(act) as service:
+                assert (await place.call(number=1))["number"] == 1
+                proxy.delay = 0.05
+                closing = asyncio.create_task(service.close())
+                await asyncio.sleep(0)
+                with pytest.raises(NoService):
+                    await place.call(number=2)
+                await closing
+                assert not await near.client.pubsub_channels("*:serve@*")
+
+
 def test_functions_of_one_name_share_the_calls_and_a_function_may_call(kvs, server_url, key):
     """Also one that is served twice in a program; a function that blocks in REEM blocks no other."""
     names = []
@@ -208,8 +225,6 @@ def test_functions_of_one_name_share_the_calls_and_a_function_may_call(kvs, serv
         assert sorted(name for (name, _), _ in answers) == list(range(8))
         assert len({thread for (_, thread), _ in answers}) == 2
         assert all(was_read for _, was_read in answers)
-    with pytest.raises((NoService, ServiceLost)):  # the first call may still find its channel
-        kvs[key()].call(name=1)
     with pytest.raises(NoService):
         kvs[key()].call(name=1)
 

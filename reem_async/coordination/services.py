@@ -171,9 +171,9 @@ class Served(Listener):
         """Stop serving. Requests that wait go to other servers, and those being handled are given up."""
         if not self.closed.is_set():
             self._manager.kept.pop(self.id, None)
-            await self._manager.unfollow_here(self)
             waiting = [each.message for each in self._waiting.values()]
             self._end()
+            await self._manager.retire(self)  # what comes until then is answered with CLOSED
             for message in waiting:
                 await self._reply(message, messages.CLOSED)
 
@@ -511,7 +511,7 @@ class Service:
                     raise InterfaceClosed(f"{self._where}: this service was closed before it began")
 
     async def close(self) -> None:
-        """Stop serving. Idempotent; one round trip for each request that waits or is being handled.
+        """Stop serving: no later call finds it. Idempotent; one round trip, and one for each request that waits.
 
         Requests that wait go to other servers. Those being handled raise ServiceLost at their callers; an asynchronous
         function is cancelled.

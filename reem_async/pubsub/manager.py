@@ -261,6 +261,17 @@ class SubscriptionManager:
         for queue in listener.queues:
             queue.close()
 
+    async def retire(self, listener: Listener) -> None:
+        """Unsubscribe the one listener to a topic; it gets what the server has delivered until then. One round trip."""
+        try:
+            wire = self._subscribed.pop(listener.topic, None)
+            self._subscribing.leave(wire, listener.topic)
+            if wire is not None and wire.alive:
+                with contextlib.suppress(ReemError, RedisError, OSError):  # its subscriptions end with a connection
+                    await wire.roundtrip([("PING",)])
+        finally:
+            await self.unfollow_here(listener)
+
     def _drop(self, listener: Listener) -> None:
         listener.lost(InterfaceClosed("this subscription was closed before it began"))
         group = self._topics.get(listener.topic, NO_LISTENERS)
