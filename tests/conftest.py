@@ -155,6 +155,7 @@ ONE_SERVER = {
 
 
 WITH_MODULE = {
+    "test_the_page_of_the_wire_format_is_what_servers_hold_and_receive": "compares a server of each kind",
     "test_the_server_never_calculates_near_the_end_of_its_range": "counts commands of the module",
     "test_a_server_takes_the_sample_configuration": "its file of users names commands of the module",
     "test_compose_starts_the_server_with_these_files": "the same",
