@@ -1,31 +1,42 @@
 """What a class or annotation is in the dictionary: objects made of stored values, and stored values of objects.
 
-A class is a dict of its fields. Nothing is imported for that: `msgspec.Struct` and `pydantic.BaseModel` are told by
-what they have, and check their own constraints when an object is made.
+A class is a dict of its fields. Classes check their own constraints when an object is made.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import collections.abc
 import datetime
 import decimal
 import enum
-import functools
+import logging
 import math
 import pathlib
 import sys
 import types
 import uuid
-from collections.abc import Callable, Mapping, Sequence
-from collections.abc import Set as AnySet
-from typing import Annotated, Any, Literal, NamedTuple, NewType, TypeVar, Union, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Final, Literal, NewType, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from ..errors import BadData, BadType, BadValue
+from .classes import (
+    WHERE_TO_DEFINE,
+    Field,
+    Use,
+    checks_itself,
+    class_of,
+    construct,
+    fields_of,
+    tag_of,
+    unknown_of,
+    with_unknown,
+)
 from .paths import Path, shorten, show
 
-_UNKNOWN = "_reem_unknown_fields"  # an attribute of objects that were read: what is stored beside their fields
+logger = logging.getLogger("reem.services")
+
 _NONE: Any = object()
 
 
@@ -37,11 +48,6 @@ class Shape(tuple[int | None, ...]):
     def __new__(cls, *lengths: int | None) -> Shape:
         """Return the shape with these lengths, outermost first."""
         return super().__new__(cls, lengths)
-
-
-class Field(NamedTuple):
-    annotation: Any
-    required: bool
 
 
 class Mismatch(Exception):
@@ -94,10 +100,14 @@ def element(annotation: Any, key: str | int, path: Path) -> Any:
     fields, origin, arguments = fields_of(annotation), get_origin(annotation), get_args(annotation)
     if fields is not None and key in fields:
         return fields[str(key)].annotation
-    if isinstance(key, str) and origin is not None and _is(origin, Mapping):
+    if isinstance(key, str) and origin in _DICTS:
         return arguments[1]
-    if isinstance(key, int) and origin is not None and _is(origin, Sequence):
-        return arguments[0] if len(arguments) < 2 or arguments[1] is ... else arguments[key]
+    if isinstance(key, int) and origin in _LISTS:
+        return arguments[0]
+    if isinstance(key, int) and origin is tuple and (arguments[-1] is ... or -len(arguments) <= key < len(arguments)):
+        return arguments[0] if arguments[-1] is ... else arguments[key]
+    if isinstance(key, int) and (items := _named_items(annotation)) and -len(items) <= key < len(items):
+        return items[key]
     has = f"; it has {', '.join(fields)}" if fields else ""
     raise BadType(f"{show(path)}: {_name(annotation)} has no {key!r}{has}")
 
@@ -109,10 +119,7 @@ class Signature:
     """
 
     def __init__(self, function: Any) -> None:
-        try:
-            hints = get_type_hints(function, include_extras=True)
-        except (NameError, TypeError, AttributeError):  # names that are only there for type checkers; no function
-            hints = {}
+        hints = _hints_of(function)
         self._result = hints.pop("return", Any)
         self._arguments = {name: hint for name, hint in hints.items() if _is_typed(hint)}
 
@@ -128,9 +135,29 @@ class Signature:
         return stored(self._result, value, path) if _is_typed(self._result) else plain(value)
 
 
+def _hints_of(function: Any) -> dict[str, Any]:
+    try:
+        return get_type_hints(function, include_extras=True)
+    except (TypeError, AttributeError):  # it is no function
+        return {}
+    except NameError as error:
+        logger.warning(
+            "the annotations of %s are not used, so it gets arguments as they are stored: %r cannot be found; %s",
+            getattr(function, "__qualname__", function),
+            error.name,
+            WHERE_TO_DEFINE,
+        )
+        return {}
+
+
 def _is_typed(annotation: Any) -> bool:
     annotation, notes = _bare(annotation)
-    is_scalar = annotation in _SCALARS or _is(annotation, enum.Enum) or _is(annotation, AnySet)
+    is_scalar = (
+        annotation in _SCALARS
+        or _is(annotation, enum.Enum)
+        or class_of(annotation) in _SETS
+        or bool(_named_items(annotation))
+    )
     below = get_args(annotation) if get_origin(annotation) not in (Literal, np.ndarray) else ()
     return bool(notes) or is_scalar or fields_of(annotation) is not None or any(_is_typed(each) for each in below)
 
@@ -160,6 +187,17 @@ _SCALARS: dict[Any, tuple[type | tuple[type, ...], Callable[[Any], Any], Callabl
 }
 
 
+# The classes that may be annotations, and what reading makes.
+_DICTS: dict[Any, Any] = {dict: dict, collections.abc.Mapping: dict, collections.abc.MutableMapping: dict}
+_LISTS: dict[Any, Any] = {list: list, collections.abc.Sequence: list, collections.abc.MutableSequence: list}
+_SETS: dict[Any, Any] = {
+    set: set,
+    frozenset: frozenset,
+    collections.abc.Set: set,
+    collections.abc.MutableSet: set,
+}
+
+
 def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
     annotation, notes = _bare(annotation)
     for note in notes:
@@ -167,20 +205,19 @@ def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
             _constrained(annotation, note, value, path)
     if annotation in (Any, object) or isinstance(annotation, TypeVar):
         return value
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin in (Union, types.UnionType):
-        return _one_of(arguments, value, path, way, _name(annotation))
-    if origin is Literal:
+    kind, arguments = class_of(annotation), get_args(annotation)
+    if kind in (Union, types.UnionType):
+        return _one_of(annotation, value, path, way)
+    if kind is Literal:
         if not any(type(each) is type(value) and each == value for each in arguments):
             raise Mismatch(path, "one of " + ", ".join(map(repr, arguments)), value)
         return value
-    kind = origin or annotation
     if kind is None or kind is type(None):
         return _checked(value, type(None), path)
     if kind is np.ndarray:
         return _array(value, arguments, notes, path)
-    if (fields := fields_of(kind)) is not None:
-        return _object(kind, fields, value, path) if way is _READ else _dict(kind, fields, value, path)
+    if (fields := fields_of(annotation)) is not None:
+        return (_object if way is _READ else _dict)(annotation, fields, value, path)
     if _is(kind, enum.Enum):
         return _member(kind, value, path, way)
     if kind in _SCALARS:
@@ -188,42 +225,70 @@ def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
     if kind is float:
         return value if type(value) is float else float(_checked(value, (int, float, np.floating, np.integer), path))
     if kind in (bool, int, str, bytes):
-        return _checked(value, (kind, np.integer) if kind is int else kind, path)
-    return _container(kind, arguments, value, path, way)
+        return _checked(value, {int: (int, np.integer), bool: (bool, np.bool_)}.get(kind, kind), path)
+    return _container(annotation, value, path, way)
 
 
-def _container(kind: Any, arguments: Any, value: Any, path: Path, way: _Direction) -> Any:
-    if _is(kind, Mapping):
+def _container(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
+    kind, arguments = class_of(annotation), get_args(annotation)
+    if kind in _DICTS:
         keys, values = arguments or (Any, Any)
         if keys not in (str, Any):
             raise BadType(f"{show(path)}: the keys of a dict are str, not {_name(keys)}; use dict[str, ...]")
         return {key: _convert(values, it, (*path, key), way) for key, it in _checked(value, Mapping, path).items()}
-    is_set = _is(kind, AnySet)
-    if not (_is(kind, Sequence) or is_set):
+    named, is_set = _named_items(kind), kind in _SETS
+    if not (kind in _LISTS or kind is tuple or is_set or named):
         raise BadType(
-            f"{show(path)}: {_name(kind)} cannot be the type of what is stored; use dataclasses, msgspec.Struct, "
-            "pydantic.BaseModel, dict[str, ...], list, tuple, set, numpy arrays, numbers, text, bytes, Enum, dates, "
-            "timedelta, Path, UUID or Decimal"
+            f"{show(path)}: {_name(annotation)} cannot be the type of what is stored; use dataclasses, msgspec.Struct, "
+            "pydantic.BaseModel, NamedTuple, dict[str, ...], list, tuple, set, numpy arrays, numbers, text, bytes, "
+            "Enum, dates, timedelta, Path, UUID or Decimal"
         )
-    items = [*_checked(value, AnySet if is_set and way is _WRITE else (list, tuple), path)]
+    classes = collections.abc.Set if is_set and way is _WRITE else kind if named and way is _WRITE else (list, tuple)
+    items = [*_checked(value, classes, path)]
     kinds = (arguments[0] if arguments else Any,) * len(items)
-    if _is(kind, tuple) and arguments and arguments[-1] is not ...:
-        if len(items) != len(arguments):
-            raise Mismatch(path, f"{len(arguments)} items", value)
-        kinds = arguments
+    if named or (kind is tuple and arguments and arguments[-1] is not ...):
+        kinds = named or arguments
+        if len(items) != len(kinds):
+            raise Mismatch(path, f"{len(kinds)} items", value)
     converted = [_convert(each, it, (*path, n), way) for n, (each, it) in enumerate(zip(kinds, items, strict=True))]
-    if way is _WRITE or not (is_set or _is(kind, tuple)):
+    if way is _WRITE:
         return converted
-    of: Callable[[list[Any]], Any] = tuple if _is(kind, tuple) else frozenset if _is(kind, frozenset) else set
-    return of(converted)
+    try:
+        return kind(*converted) if named else {**_LISTS, **_SETS, tuple: tuple}[kind](converted)
+    except TypeError:  # in a set
+        raise Mismatch(path, f"{_name(annotation)}, whose items have to be hashable", value) from None
 
 
-def _one_of(choices: tuple[Any, ...], value: Any, path: Path, way: _Direction, name: str) -> Any:
-    """Return what the first fitting choice makes of a value; of several classes, the one whose fields fit best."""
+def _named_items(kind: Any) -> tuple[Any, ...]:
+    """Return the annotations of the items of a NamedTuple, in their order."""
+    if not (_is(kind, tuple) and hasattr(kind, "_fields")):
+        return ()
+    hints = get_type_hints(kind, include_extras=True)
+    return tuple(hints.get(name, Any) for name in kind._fields)
+
+
+def _one_of(union: Any, value: Any, path: Path, way: _Direction) -> Any:
+    """Return what the first fitting choice makes of a value; of several classes, the one whose fields fit best.
+
+    Raises BadType for an object that would be read as one of another choice.
+    """
+    choices = get_args(union)
+    chosen, result = _chosen(choices, value, path, way, _name(union))
+    if way is _WRITE and len(choices) - (type(None) in choices) > 1:
+        read, _ = _chosen(choices, result, path, _READ, _name(union))
+        if read is not chosen:
+            raise BadType(
+                f"{show(path)}: in {_name(union)} this {_name(chosen)} would be read as {_name(read)}, since what is "
+                "stored fits both; use one of them, or classes with a field that differs, such as kind: Literal['a']"
+            )
+    return result
+
+
+def _chosen(choices: tuple[Any, ...], value: Any, path: Path, way: _Direction, name: str) -> tuple[Any, Any]:
     deepest: Mismatch | None = None
     for choice in sorted(choices, key=lambda choice: _distance(choice, value)):
         try:
-            return _convert(choice, value, path, way)
+            return choice, _convert(choice, value, path, way)
         except Mismatch as error:
             if len(error.args[0]) > len(deepest.args[0] if deepest else path):
                 deepest = error
@@ -233,27 +298,32 @@ def _one_of(choices: tuple[Any, ...], value: Any, path: Path, way: _Direction, n
 def _distance(choice: Any, value: Any) -> float:
     """Return how far a value is from a choice: below any other if it is of its class."""
     kind, _ = _bare(choice)
-    if type(value) is (get_origin(kind) or kind):
+    if type(value) is class_of(kind):
         return -math.inf
     fields = fields_of(kind)
     return len(fields.keys() ^ value.keys()) if fields is not None and isinstance(value, Mapping) else 0
 
 
-def _object(kind: Any, fields: dict[str, Field], value: Any, path: Path) -> Any:
+def _object(annotation: Any, fields: dict[str, Field], value: Any, path: Path) -> Any:
     _checked(value, Mapping, path)
-    found = {}
+    found: dict[Use, dict[str, Any]] = {use: {} for use in Use}
     for name, field in fields.items():
         if name in value:
-            found[name] = _convert(field.annotation, value[name], (*path, name), _READ)
+            found[field.use][name] = _convert(field.annotation, value[name], (*path, name), _READ)
         elif field.required:
             raise Mismatch((*path, name), _name(field.annotation), _NONE)
+    unknown = {name: each for name, each in value.items() if name not in fields}
+    result = _constructed(annotation, found[Use.ARGUMENT], unknown, value, path)
+    for name, each in found[Use.STATE].items():
+        object.__setattr__(result, name, each)
+    return with_unknown(result, unknown)
+
+
+def _constructed(annotation: Any, values: dict[str, Any], unknown: dict[str, Any], value: Any, path: Path) -> Any:
     try:
-        result = kind.model_validate(found) if hasattr(kind, "model_validate") else kind(**found)
-    except (TypeError, ValueError) as error:  # what the class itself checks
-        raise Mismatch(path, f"what {_name(kind)} takes ({error!s:.200})", value) from error
-    if (unknown := {name: each for name, each in value.items() if name not in fields}) and hasattr(result, "__dict__"):
-        object.__setattr__(result, _UNKNOWN, unknown)
-    return result
+        return construct(annotation, values, unknown)
+    except Exception as error:  # what the class itself checks
+        raise Mismatch(path, f"what {_name(annotation)} takes ({' '.join(str(error).split()):.200})", value) from error
 
 
 def _constrained(annotation: Any, note: Any, value: Any, path: Path) -> None:
@@ -265,36 +335,28 @@ def _constrained(annotation: Any, note: Any, value: Any, path: Path) -> None:
         raise Mismatch(path, f"what its Meta says ({error})", value) from None
 
 
-def _dict(kind: Any, fields: dict[str, Field], value: Any, path: Path) -> dict[str, Any]:
+def _dict(annotation: Any, fields: dict[str, Field], value: Any, path: Path) -> dict[str, Any]:
+    kind = class_of(annotation)
     _checked(value, kind, path)
-    found = {name: _convert(it.annotation, getattr(value, name), (*path, name), _WRITE) for name, it in fields.items()}
-    return {**getattr(value, _UNKNOWN, {}), **found}
-
-
-def fields_of(kind: Any) -> dict[str, Field] | None:
-    """Return the fields of a class by their names; None if it has none."""
-    return _fields_of(kind) if isinstance(kind, type) else None
-
-
-@functools.lru_cache(maxsize=1024)
-def _fields_of(kind: Any) -> dict[str, Field] | None:
-    if dataclasses.is_dataclass(kind):
-        missing = dataclasses.MISSING
-        required = {
-            each.name: each.default is missing and each.default_factory is missing
-            for each in dataclasses.fields(kind)
-            if each.init
-        }
-    elif hasattr(kind, "model_fields") and hasattr(kind, "model_validate"):
-        required = {name: field.is_required() for name, field in kind.model_fields.items()}
-    elif hasattr(kind, "__struct_fields__"):
-        none = sys.modules["msgspec"].NODEFAULT
-        defaults = [none] * (len(kind.__struct_fields__) - len(kind.__struct_defaults__)) + [*kind.__struct_defaults__]
-        required = {name: given is none for name, given in zip(kind.__struct_fields__, defaults, strict=True)}
-    else:
-        return None
-    hints = get_type_hints(kind, include_extras=True)
-    return {name: Field(hints[name], needed) for name, needed in required.items()}
+    if type(value) is not kind and (more := (fields_of(type(value)) or {}).keys() - fields.keys()):
+        raise Mismatch(
+            path, f"{_name(kind)} itself, since {', '.join(sorted(more))} of its subclass would be lost", value
+        )
+    found, arguments = {}, {}
+    for name, field in fields.items():
+        if (tag := tag_of(kind, name)) is not None:
+            found[name] = tag
+            continue
+        item = getattr(value, name, _NONE)
+        if item is _NONE:
+            raise Mismatch((*path, name), _name(field.annotation), _NONE)
+        found[name] = _convert(field.annotation, item, (*path, name), _WRITE)
+        if field.use is Use.ARGUMENT:
+            arguments[name] = item
+    unknown = unknown_of(value)
+    if checks_itself(annotation):  # an attribute may have been set since the object was made
+        _constructed(annotation, arguments, unknown, value, path)
+    return {**unknown, **found}
 
 
 def _bare(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -303,6 +365,10 @@ def _bare(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
     while True:
         if isinstance(annotation, NewType):
             annotation = annotation.__supertype__
+        elif hasattr(annotation, "__value__"):  # of a `type` statement
+            annotation = annotation.__value__
+        elif get_origin(annotation) is Final:
+            annotation = get_args(annotation)[0]
         elif get_origin(annotation) is Annotated:
             annotation, notes = annotation.__origin__, (*annotation.__metadata__, *notes)
         else:
@@ -325,11 +391,20 @@ def _array(value: Any, arguments: tuple[Any, ...], notes: tuple[Any, ...], path:
 
 def _member(kind: Any, value: Any, path: Path, way: _Direction) -> Any:
     if way is _WRITE:
-        return _checked(value, kind, path).value
+        return _lists(_checked(value, kind, path).value)
     try:
+        if isinstance(value, bool) and not any(isinstance(each.value, bool) for each in kind):
+            raise ValueError("a bool is no number")
         return kind(value)
-    except ValueError:
+    except (ValueError, TypeError):
+        for each in kind:  # whose value is a tuple
+            if isinstance(each.value, tuple) and _lists(each.value) == value:
+                return each
         raise Mismatch(path, f"a value of {_name(kind)}: {', '.join(repr(it.value) for it in kind)}", value) from None
+
+
+def _lists(value: Any) -> Any:
+    return [_lists(each) for each in value] if isinstance(value, tuple) else value
 
 
 def _scalar(kind: Any, value: Any, path: Path, way: _Direction) -> Any:
@@ -338,7 +413,8 @@ def _scalar(kind: Any, value: Any, path: Path, way: _Direction) -> Any:
         raise Mismatch(path, "date", value)
     if way is _WRITE:
         text = to(_checked(value, kind, path))
-        if make(text) != value and value == value:
+        is_nan = isinstance(value, decimal.Decimal) and value.is_nan()
+        if not is_nan and make(text) != value:
             raise Mismatch(path, f"a {_name(kind)} that {text!r} stands for exactly", value)
         return text
     try:
