@@ -315,12 +315,16 @@ def of_library(module, name):
     return type("Derived", (type(name, (), {"__module__": module}),), {"__module__": "mine"})()
 
 
+def typed(name):
+    return f"or use kvs[...].of({name}).write(value), which .of({name}).read() reads back"
+
+
 @pytest.mark.parametrize(
     ("value", "instead"),
     [
-        (Pose(), "use dataclasses.asdict(value)"),
-        (pathlib.Path("/x"), "use str(value)"),
-        (uuid.uuid4(), "use str(value)"),
+        (Pose(), f"use dataclasses.asdict(value); {typed('Pose')}"),
+        (pathlib.Path("/x"), f"use str(value); {typed('pathlib.Path')}"),
+        (uuid.uuid4(), f"use str(value); {typed('UUID')}"),
         (memoryview(b"abc"), "use bytes(value), or np.asarray(value)"),
         (range(3), "use list(value)"),
         (collections.UserDict(a=1), "use dict(value)"),

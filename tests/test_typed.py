@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 import pydantic
 import pytest
+import typetable
 from conftest import ROOT, sized
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -482,6 +483,12 @@ def test_what_could_not_be_read_again_is_refused(annotation, value, message):
         value.width, message = -1.0, r"k: expected what Rectangle takes \(width is below 0\), found Rectangle"
     with pytest.raises((reem.BadType, reem.BadValue), match=message):
         stored(annotation, value, ("k",))
+
+
+def test_the_table_of_types_in_the_documentation_is_what_a_server_does(kvs, key):
+    """`python -m tests.typetable` writes it again."""
+    page = typetable.PAGE.read_text()
+    assert page == typetable.written(page, typetable.table(kvs, key()))
 
 
 PROGRAM = """

@@ -10,6 +10,7 @@ from __future__ import annotations
 import array
 import datetime
 import enum
+import itertools
 import marshal
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -304,38 +305,56 @@ _LIBRARIES = {
     ("torch", "Tensor"): "value.numpy(force=True)",
 }
 
+# By an attribute of classes with fields, in this order: what makes a dict of an object.
+_CLASSES = {
+    "model_dump": "value.model_dump(mode='json')",
+    "__struct_fields__": "msgspec.to_builtins(value)",
+    "__dataclass_fields__": "dataclasses.asdict(value)",
+}
+
 
 def _remedy(value: Any) -> str:
     # Imported here, since they take time and only refusals need them.
-    import dataclasses
+    import decimal
     import numbers
     import pathlib
     import uuid
 
+    if (how := getattr(value, "_how_to_read", None)) is not None:
+        return f"it is a handle: store the value there, with {how}"
+    kind = type(value)
+    for each in kind.__mro__:
+        if (how := _LIBRARIES.get((each.__module__.partition(".")[0], each.__name__))) is not None:
+            return f"use {how}"
+    # What a typed view stores as well, and its name there: that of the class if it is empty.
+    typed: tuple[tuple[Any, str, str], ...] = (
+        (enum.Enum, "", "value.value, or value.name"),
+        (set, "set", "list(value), or sorted(value)"),
+        (frozenset, "frozenset", "list(value), or sorted(value)"),
+        (datetime.datetime, "datetime", "value.isoformat(), value.timestamp() or integer nanoseconds"),
+        (datetime.date, "date", "value.isoformat()"),
+        (datetime.time, "time", "value.isoformat()"),
+        (datetime.timedelta, "timedelta", "value.total_seconds()"),
+        (decimal.Decimal, "Decimal", "str(value), or float(value), which rounds"),
+        (pathlib.PurePath, "pathlib.Path", "str(value)"),
+        (uuid.UUID, "UUID", "str(value)"),
+    )
+    classes = (("", how) for attribute, how in _CLASSES.items() if hasattr(kind, attribute))
+    scalars = ((name, how) for base, name, how in typed if isinstance(value, base))
+    for name, how in itertools.chain(classes, scalars):
+        name = name or kind.__name__
+        return f"use {how}; or use kvs[...].of({name}).write(value), which .of({name}).read() reads back"
     remedies: tuple[tuple[Any, str], ...] = (
         (placeholders.Unreadable, "it could not be read; leave it out, or store a value in its place"),
-        (enum.Enum, "store its .value or .name"),
-        ((set, frozenset), "use a list, such as sorted(value)"),
         (complex, "use [value.real, value.imag] or a numpy array"),
         (numbers.Number, "use float(value) or str(value)"),
-        ((datetime.datetime, datetime.date), "use value.timestamp(), integer nanoseconds, or value.isoformat()"),
-        (datetime.timedelta, "use value.total_seconds()"),
         (np.ma.MaskedArray, "use {'data': x.filled(0), 'mask': np.ma.getmaskarray(x)}, or a ship for its class"),
         ((np.ndarray, array.array), _array_remedy(value)),
         ((bytes, bytearray), "add BytesShip() to the interface's ships, or use bytes(value)"),
         (memoryview, "use bytes(value), or np.asarray(value)"),
-        (pathlib.PurePath, "use str(value)"),
-        (uuid.UUID, "use str(value)"),
         (Mapping, "use dict(value)"),
         (Iterable, "use list(value)"),
     )
-    if (how := getattr(value, "_how_to_read", None)) is not None:
-        return f"it is a handle: store the value there, with {how}"
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return "use dataclasses.asdict(value)"
-    for kind in type(value).__mro__:
-        if (how := _LIBRARIES.get((kind.__module__.partition(".")[0], kind.__name__))) is not None:
-            return f"use {how}"
     anything = "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"
     return next((text for kinds, text in remedies if isinstance(value, kinds)), anything)
 

@@ -117,6 +117,8 @@ def shorten(value: object, limit: int = 60) -> str:
         text = repr(value)
     except Exception:  # a broken __repr__ must not hide the real error
         text = f"<{type(value).__name__}>"
+    if "\n" in text:  # of a table, for example
+        text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
