@@ -6,6 +6,7 @@ import asyncio
 import datetime
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +18,7 @@ from ...connection import RedisInterface
 from .export import export
 from .following import progress
 from .options import AsJson, Only, Recording, with_server
-from .output import clean, columns, emit, emit_json, figures, progress_bar, size_text, styled
+from .output import clean, columns, counted, emit, emit_json, figures, named, progress_bar, size_text, styled
 from .running import USAGE, CommandFailed, run_local
 
 if TYPE_CHECKING:
@@ -230,19 +231,31 @@ def _print(log: Log, channels: list[ChannelSummary]) -> None:
         ("file", f"{log.path}, {size_text(log.path.stat().st_size)}, {complete}{damage}"),
         ("time", f"{_when(log.start)} to {_when(log.end)}, {log.duration:.1f} s"),
         ("messages", f"{sum(each.messages for each in channels)} in {len(channels)} channels"),
-        (
-            "recorded",
-            f"{metadata.get('patterns') or 'samples'} by {metadata.get('user', '')}@{metadata.get('host', '')}",
-        ),
-        ("server", metadata.get("server", "")),
-        ("missing", _missing(log)),
     ]
+    if log.foreign:
+        profile = f", profile {metadata['profile']}" if metadata.get("profile") else ""
+        lines.append(("recorded", f"by another program: {metadata.get('library') or 'unnamed'}{profile}"))
+        lines += [("skipped", text) for text in _skipped(channels)]
+    else:
+        who = f"{metadata.get('user', '')}@{metadata.get('host', '')}"
+        lines.append(("recorded", f"{metadata.get('patterns') or 'samples'} by {who}"))
+        lines += [("server", metadata.get("server", "")), ("missing", _missing(log))]
     for label, text in lines:
         emit(styled(f"{label:9}", "cyan") + clean(text))
 
 
+def _skipped(channels: list[ChannelSummary]) -> Iterator[str]:
+    """Yield what is left out for each reason."""
+    for reason in dict.fromkeys(each.skipped for each in channels if each.skipped):
+        those = [each for each in channels if each.skipped == reason]
+        messages = counted(sum(each.messages for each in those), "message")
+        yield f"{messages} of {named([each.topic for each in those])}: {reason}"
+
+
 def _role(each: ChannelSummary) -> str:
     """Return what the messages of a channel are, and where they come from if they were not published."""
+    if each.skipped:
+        return "skipped"
     return each.role + {"stored": " (stored)", "kvs": " (read)"}.get(each.kind, "")
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Channel, Chunk, Header, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
 from .format import DamagedRecording
@@ -222,7 +222,9 @@ class Container:
         self._source = Source(path)
         try:
             if self._source.peek(0, len(MAGIC)) != MAGIC:
-                raise DamagedRecording(f"{path} is not an MCAP file; give one that `reem record` wrote")
+                raise DamagedRecording(
+                    f"{path} is not an MCAP file; give one that `reem record`, or another program, wrote"
+                )
             self.size = self._source.size
             self._contents = self._read_contents(progress)
         except BaseException:
@@ -250,6 +252,17 @@ class Container:
         self.damaged += scan.damaged + scan.contents.unknown()
         self.damaged += not self.damaged and self._messages not in (None, scan.messages)
         return scan.contents
+
+    def header(self) -> dict[str, str]:
+        """Return which profile and library the file names; nothing if that is damaged."""
+        try:
+            opcode, length = HEAD.unpack(self._source.peek(len(MAGIC), HEAD.size))
+            if opcode != Opcode.HEADER:
+                return {}
+            header = Header.read(ReadDataStream(io.BytesIO(self._source.peek(len(MAGIC) + HEAD.size, length))))
+        except MALFORMED:
+            return {}
+        return {"profile": header.profile, "library": header.library}
 
     def close(self) -> None:
         with self._lock:

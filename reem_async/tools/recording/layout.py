@@ -271,7 +271,7 @@ def encode(label: str, value: Any, frame: str, time: int) -> EncodedMessage:
     """
     if isinstance(value, np.ndarray):
         return _picture(value, frame, time) if _is_picture(label, value) else _array_message(value, time)
-    picture = value.label if isinstance(value, EncodedImage) else _compressed(value) if label == "bytes" else ""
+    picture = value.label if isinstance(value, EncodedImage) else picture_format(value) if label == "bytes" else ""
     value = value.data if isinstance(value, EncodedImage) else value
     if picture:
         head = _CLASSES["foxglove.CompressedImage"](frame_id=frame, format=picture)
@@ -331,7 +331,7 @@ def _array_message(array: np.ndarray[Any, Any], time: int) -> EncodedMessage:
 _MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}
 
 
-def _compressed(data: bytes) -> str:
+def picture_format(data: bytes) -> str:
     """Return the format of a compressed picture, "" for anything else."""
     return next((name for magic, name in _MAGIC.items() if data.startswith(magic)), "")
 

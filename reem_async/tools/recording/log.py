@@ -25,7 +25,7 @@ from .episodes import Episode, episodes_of
 from .format import NEWS, Role
 from .log_reader import RecordedPast, RecordedStream
 from .stored import LOST, Reference, pruned, resolve
-from .times import Instant, nanoseconds, seconds
+from .times import Instant, before, nanoseconds, seconds, up_to
 
 # Whole keys as they were at some instant: a slider, or a walk through time, asks for neighbours again and
 # again.
@@ -106,6 +106,7 @@ class ChannelSummary:
         bytes: Their size, before compression.
         first: The instant of the first, 0 if there is none.
         last: The instant of the last.
+        skipped: Why its messages are left out, in a file that another program has written; else "".
     """
 
     topic: str
@@ -117,6 +118,7 @@ class ChannelSummary:
     bytes: int
     first: float
     last: float
+    skipped: str = ""
 
     @property
     def rate(self) -> float:
@@ -132,6 +134,10 @@ def open_log(
 ) -> Log:
     """Open a recording; one whose recorder was killed, or that was damaged or rewritten by another tool, opens too.
 
+    So does an MCAP file of another program: a topic `/a/b` is the key `a/b`, and each message an update of it, a plain
+    dict at its log time. ROS 2 (CDR with `ros2msg` definitions), protobuf and JSON are decoded. Other channels are left
+    out, and `Log.channels` says why.
+
     What is damaged or missing is left out, and counted in `Log.damaged`. If another program replaces the file while it
     is open, the old one is read on. If it cuts the file short, a read beyond the new end raises OSError.
 
@@ -142,7 +148,7 @@ def open_log(
             summary is damaged or leaves something out.
 
     Raises:
-        DamagedRecording: Not a recording of REEM.
+        DamagedRecording: Not an MCAP file, or without a channel.
         OSError: The file cannot be read.
     """
     return Log(path, ships, progress=progress)
@@ -217,8 +223,18 @@ class Log:
         return max(self._past.unreadable, self._container.damaged)
 
     @property
+    def foreign(self) -> bool:
+        """Whether another program has recorded it."""
+        return self._past.foreign is not None
+
+    @property
     def metadata(self) -> dict[str, str]:
-        """What the recorder says of itself: who, when, versions, patterns, and at the end its counts."""
+        """What the recorder says of itself: who, when, versions, patterns, and at the end its counts.
+
+        Of a recording of another program, the profile and the library that the file names.
+        """
+        if self.foreign:
+            return self._container.header()
         said: dict[str, str] = {}
         for record in self._container.metadata:
             if record.name == "reem":
@@ -245,9 +261,9 @@ class Log:
         """
         place = parse(path) if isinstance(path, str) else tuple(path)
         if not place:
-            trees = self._trees_at(nanoseconds(instant))
+            trees = self._trees_at(up_to(instant))
             return {name: resolve(tree, self._recorded) for name, tree in trees.items()}
-        found = self._past.tree(place, nanoseconds(instant))
+        found = self._past.tree(place, up_to(instant))
         if found is MISSING:
             raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
         return self._load(found) if type(found) is Reference else resolve(found, self._recorded)
@@ -265,7 +281,7 @@ class Log:
         What cannot be read is counted in `unreadable`. An item of a list is None then: the others keep their places.
         """
         try:
-            tree = self._past.tree((name,), nanoseconds(instant))
+            tree = self._past.tree((name,), up_to(instant))
         except ValueError:  # all of it is damaged
             self._past.unreadable += 1
             return MISSING
@@ -283,7 +299,7 @@ class Log:
 
     def tree_at(self, instant: Instant) -> dict[str, Any]:
         """Return all that there was at an instant: a dict by top-level key; longer arrays as `ArrayHandle`."""
-        trees = self._trees_at(nanoseconds(instant))
+        trees = self._trees_at(up_to(instant))
         return {name: resolve(tree, self._handle) for name, tree in trees.items()}
 
     def _handle(self, it: Reference) -> ArrayHandle:
@@ -295,7 +311,7 @@ class Log:
 
     def changes(self, after: Instant, until: Instant) -> set[Path]:
         """Return the paths that were updated after one instant and not after another."""
-        numbers = self._past.timeline.channels_between(nanoseconds(after), nanoseconds(until))
+        numbers = self._past.timeline.channels_between(up_to(after), up_to(until))
         return {it.path for number, it in self._past.of_channel.items() if number in numbers and it.role in NEWS}
 
     def news_times(self, path: Path) -> np.ndarray[Any, Any]:
@@ -305,12 +321,12 @@ class Log:
 
     def news_count(self, path: Path, after: Instant, until: Instant) -> int:
         """Return how many such updates there were after one instant and not after another."""
-        span = nanoseconds(after), nanoseconds(until)
+        span = up_to(after), up_to(until)
         return sum(1 for _ in self._past.timeline.between(self._past.news_channels(path), *span))
 
     def last_news(self, path: Path, instant: Instant) -> float | None:
         """Return when the last such update before an instant was, None if there was none."""
-        newest = self._past.newest(self._past.concerning(path), nanoseconds(instant), -1)
+        newest = self._past.newest(self._past.concerning(path), up_to(instant), -1)
         return None if newest is None else seconds(newest[0].time)
 
     def gaps(self) -> list[tuple[float, str, int | None]]:
@@ -345,8 +361,8 @@ class Log:
             partial: An update is left out, and counted in `unreadable`, if anything in its value is damaged or was
                 not recorded. With this, only that is left out of the value; an item of a list is None then.
         """
-        after = -1 if start is None else nanoseconds(start) - 1
-        until = _END if end is None else nanoseconds(end)
+        after = -1 if start is None else before(start)
+        until = _END if end is None else up_to(end)
         for ref, stream, value in self._news(after, until, patterns):
             read = resolve(value, self._whole) if partial else self._whole(value)
             if value is MISSING:
@@ -419,11 +435,12 @@ class Log:
         if clock not in CLOCKS:
             raise BadValue(f"clock={shorten(clock)} is none of {', '.join(CLOCKS)}")
         places = {path: self._known(path) for path in paths}
-        first, last = nanoseconds(self.start if start is None else start), nanoseconds(self.end if end is None else end)
+        begin = self.start if start is None else start
+        first, last = nanoseconds(begin), up_to(self.end if end is None else end)
         if rate is not None:
             instants = partial(at_rate, rate, first, last)
         else:
-            instants = partial(self._instants, self._known(on or ""), clock, first, last)
+            instants = partial(self._instants, self._known(on or ""), clock, before(begin) + 1, last)
         return Alignment(
             self._past, self._whole, places, instants, first, clock=clock, method=method, tolerance=tolerance
         )
@@ -463,7 +480,8 @@ class Log:
             place = (show(stream.path), stream.role.value, stream.kind.value) if stream else ("", "", "")
             messages, size, first, last = totals.get(channel.id, Totals())
             title, span = schema.name if schema else "", (seconds(first), seconds(last))
-            found.append(ChannelSummary(channel.topic, *place, title, messages, size, *span))
+            skipped = self._past.foreign.skipped.get(channel.id, "") if self._past.foreign else ""
+            found.append(ChannelSummary(channel.topic, *place, title, messages, size, *span, skipped))
         return sorted(found, key=lambda it: (it.topic, it.role, it.path))
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
@@ -530,8 +548,8 @@ class LogPath:
         """Yield what `history` returns one by one, for what is larger than memory."""
         if clock not in ("recorder", "publisher"):
             raise BadValue(f"clock={clock!r:.40} is neither 'recorder' nor 'publisher'")
-        after = -1 if start is None else nanoseconds(start) - 1
-        until = _END if end is None else nanoseconds(end)
+        after = -1 if start is None else before(start)
+        until = _END if end is None else up_to(end)
         for refs, repeats, tree in self._log._past.following(self.path, after, until):
             ns = refs[0].time if clock == "recorder" else self._log._past.published(refs)
             if repeats or ns is None or (whole := self._log._whole(tree)) is MISSING:

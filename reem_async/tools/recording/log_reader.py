@@ -19,6 +19,7 @@ from ...plan.trees import MISSING, get, same
 from ...ships.images import EncodedImage
 from ...ships.registry import Ships
 from .container import Container, Ref, Timeline
+from .foreign import Foreign
 from .format import NEWS, DamagedRecording, Kind, Role
 from .layout import decode, from_json
 from .sink import CHANNELS
@@ -62,9 +63,15 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 stream.channels.append(channel.id)
                 self.of_channel[channel.id] = stream
         is_described = any(record.name == "reem" for record in container.metadata)
-        if not by_place and not is_described:
-            raise DamagedRecording(f"{container.path} is an MCAP file, but not a recording of REEM")
-        container.damaged += self._missing(is_described)
+        if not container.channels and not is_described:
+            raise DamagedRecording(f"{container.path} is an MCAP file without a channel: it holds nothing")
+        self.foreign = None if by_place or is_described else Foreign(container)
+        if self.foreign is None:
+            container.damaged += self._missing(is_described)
+        for number, key in () if self.foreign is None else self.foreign.keys.items():
+            place = (key,), Role.UPDATE, Kind.PUBLISHED
+            self.of_channel[number] = stream = by_place.setdefault(place, RecordedStream(*place, []))
+            stream.channels.append(number)
         self.streams = list(by_place.values())
         self.names: dict[str, list[RecordedStream]] = {}
         self._parts: dict[Path, list[int]] = {}
@@ -174,6 +181,11 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         """Return the value of a message, MISSING for a deletion; raises _FoundDamage, BadData."""
         if stream.role == Role.DELETE:
             return MISSING
+        if self.foreign is not None:
+            found = self.foreign.tree(ref)
+            if found is MISSING:
+                raise _FoundDamage
+            return found
         message = self._container.message(ref)
         if message is None:
             raise _FoundDamage
@@ -185,11 +197,15 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def _readable(self, ref: Ref, stream: RecordedStream) -> Any:
         """Return the value of a message; _DAMAGED, and it is counted, if it cannot be read."""
         try:
-            return self._load(ref, stream)
+            value = self._load(ref, stream)
         except (_FoundDamage, BadData):
+            value = _DAMAGED
+        # What another program has recorded, and cannot be decoded, is no part of any update.
+        if value is _DAMAGED or (self.foreign is not None and type(value) is Reference and value.label == LOST):
             self.unreadable += 1
             self._has_skipped = True
             return _DAMAGED
+        return value
 
     def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Reference:
         """Return what stands for a value that is a message of its own and not a part of another."""
@@ -211,6 +227,11 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         """Return the value that something stands for; raises DamagedRecording."""
         if it.label == LOST:
             raise DamagedRecording(f"{it.shown}: {it.summary}")
+        if self.foreign is not None and it.where is not None:
+            value = self.foreign.value(it)
+            if not isinstance(value, EncodedImage):
+                return value
+            return (ships or self._ships).labelled(it.label, it.shown).ship.interpret_read([value.data])
         for channel in self._parts.get(it.path, ()):
             ref = self.timeline.latest(channel, it.at, it.at - 1)
             message = None if ref is None else self._container.message(ref)

@@ -10,6 +10,8 @@ from functools import reduce
 from operator import getitem
 from typing import Any
 
+import numpy as np
+
 from ...connection import RedisInterface
 from ...errors import BadKey, BadValue, MissingKey, PathRefused
 from ...plan.paths import Path, Pattern, check_top_key, has_index, parse, parse_pattern
@@ -18,7 +20,7 @@ from ...plan.writes import make_parents
 from ...store.store import PublishSpace
 from .format import Kind
 from .log import Log, LogUpdate
-from .times import Instant, nanoseconds, seconds
+from .times import AFTER, Instant, nanoseconds, seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +191,7 @@ class Replayer:
         self._position = self.start
         # A microsecond later: what happened at the start is in the trees already, and times of floats are exact to
         # that.
-        after = seconds(nanoseconds(self.start) + 1000)
+        after = np.datetime64(nanoseconds(self.start) + AFTER, "ns")
         return self._log.updates(after, self.end, self._texts, partial=True)
 
     def _whole(self, name: str) -> Any:

@@ -70,6 +70,7 @@ class Reference:
     shape: tuple[int, ...] | None = None  # of an array
     content: Content | None = field(default=None, compare=False, repr=False)
     numbers: np.ndarray[Any, Any] | None = field(default=None, compare=False, repr=False)
+    where: Any = None  # the message that has it, in a file of another program
 
     @property
     def shown(self) -> str:

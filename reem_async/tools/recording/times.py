@@ -46,6 +46,16 @@ def nanoseconds(instant: Any) -> int:
     return _rounded(since)
 
 
+def up_to(instant: Any) -> int:
+    """Return the last ns of an instant: a float is a whole microsecond, in which other programs have several times."""
+    return nanoseconds(instant) + (0 if isinstance(instant, np.datetime64) else AFTER - 1)
+
+
+def before(instant: Any) -> int:
+    """Return the last ns before an instant."""
+    return nanoseconds(instant) - (1 if isinstance(instant, np.datetime64) else AFTER)
+
+
 def _rounded(since: float) -> int:
     whole = int(since)
     # The fraction by itself: a product of more than 2**51 microseconds would be rounded before it is rounded here.
