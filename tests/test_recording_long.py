@@ -5,11 +5,15 @@ import os
 import numpy as np
 import pytest
 
+from reem_async.plan.paths import parse
+from reem_async.ships.registry import Ships, default_ships
 from reem_async.tools.recording import open_log
 from reem_async.tools.recording.container import Container
 from reem_async.tools.recording.format import Kind, Role
 from reem_async.tools.recording.layout import to_json
 from reem_async.tools.recording.sink import Sink
+from reem_async.tools.recording.writer_thread import Operation, WriterThread
+from reem_async.transport.protocol import CommandRecorder
 
 KEYS, CHUNKS = 20, 400
 START, STEP = 1_700_000_000_000_000_000, 250_000_000
@@ -96,6 +100,68 @@ def test_what_the_index_says_is_what_there_is(file):
         times, values = log["k0"]["n"].history()
         assert values.tolist() == [chunk for chunk in range(CHUNKS) for _ in range(2)]
         assert len(times) == 2 * CHUNKS
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """Keys with a number and a picture in one dict, and others with numbers only; a flush for every four of them."""
+    file = tmp_path_factory.mktemp("mixed") / "run.mcap"
+    sink = Sink(file, "zstd", {}, overwrite=False)
+    sink.output.appear()
+    writer = WriterThread(sink, Ships(default_ships(), CommandRecorder), 0)
+    for step in range(40):
+        now = START + step * STEP
+        picture = np.full((100, 100), step, np.uint8)
+        writer._write(Operation(Role.UPDATE, ("cam",), {"t": step, "rgb": picture}, (now, now, step)))
+        joints = {"q": np.full(7, step / 2), "n": step, "mode": f"m{step}", "big": 2**60 + step, "a": [step] * 3}
+        writer._write(Operation(Role.UPDATE, ("arm",), joints, (now + 2000, now, step)))
+        if step % 4 == 3:
+            sink._closed_at -= 1
+            sink.tick()
+    sink.finish({})
+    return file
+
+
+def test_numbers_are_read_without_the_pictures_between_them(mixed, monkeypatch):
+    sizes, content = [], Container.content
+
+    def noted(self, info):
+        sizes.append(info.length)
+        return content(self, info)
+
+    monkeypatch.setattr(Container, "content", noted)
+    for path, values in {
+        "cam.t": range(40),
+        "arm.q": [[step / 2] * 7 for step in range(40)],
+        "arm.n": range(40),
+        "arm.a": [[step] * 3 for step in range(40)],
+        "arm.big": [2**60 + step for step in range(40)],
+        "arm.mode": [f"m{step}" for step in range(40)],
+    }.items():
+        with open_log(mixed) as log:
+            sizes.clear()
+            times, found = log[path].history()
+            assert np.array(found).tolist() == np.array(list(values)).tolist()
+            assert times.tolist() == [time for time, _ in log[path].values()] == log.news_times(parse(path)).tolist()
+            assert 10 <= len(sizes) <= 20 + 400 * (path == "arm.big")
+            assert max(sizes) < 3000
+            assert len(log._container.every_chunk) == 20
+    with open_log(mixed) as log:
+        assert [value["rgb"][0, 0] for _, value in log["cam"].values()] == list(range(40))
+        assert log.verify() == 0
+
+
+def test_wherever_a_recording_ends_a_number_has_its_picture(mixed, tmp_path):
+    killed, data = tmp_path / "killed.mcap", mixed.read_bytes()
+    with open_log(mixed) as log:
+        ends = [info.index + info.index_length for info in log._container.every_chunk]
+    for end in ends:
+        killed.write_bytes(data[:end])
+        with open_log(killed) as log:
+            times, found = log["cam"]["t"].history() if "cam" in log.names() else ([], [])
+            assert [log["cam"]["rgb"].at(time)[0, 0] for time in times] == list(found)
+            assert len(found) in (0, *range(0, 41, 4))
+            assert (log.unreadable, log.damaged) == (0, 0)
 
 
 def test_cut_short_while_it_is_open_it_raises(file, tmp_path):

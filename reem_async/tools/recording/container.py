@@ -7,12 +7,11 @@ damaged is left out and counted: a whole chunk, or all that follows a damaged re
 
 from __future__ import annotations
 
-import heapq
 import io
 import struct
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import NamedTuple
@@ -39,6 +38,7 @@ from .mcap_reader import (
     index_places,
     parse_index,
     read_footer,
+    read_part,
     read_summary,
     record_starts,
 )  # fmt: skip
@@ -51,6 +51,8 @@ _SMALLEST_CHUNK, _LARGEST_CHUNK = 40, 1 << 31
 """Bytes. REEM closes a chunk with the message that takes it over a megabyte."""
 _BARE_BYTES = 1 << 20
 """Bytes of messages outside of chunks that are read as one chunk."""
+_CHUNK_HEAD = struct.Struct("<QQQII")
+"""First and last log time, size and CRC-32 of the content, length of the name of the compression."""
 # What other records of these kinds would hide: all that follows.
 _END_LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
@@ -66,20 +68,37 @@ class Message(NamedTuple):
     data: bytes
 
 
+class Ref(NamedTuple):
+    """Where a message is, and its log time in ns.
+
+    The channel is last: of one instant, messages come in the order of the file, whatever numbers another tool has
+    given to the channels.
+    """
+
+    time: int
+    chunk: ChunkInfo
+    offset: int
+    channel: int
+
+
 def _unpacked(source: Source, info: ChunkInfo) -> bytes | None:
     if info.bare:
         return source.read(info.offset, info.length)
     body = source.read(info.offset + HEAD.size, info.length - HEAD.size)
     try:
-        chunk = Chunk.read(ReadDataStream(io.BytesIO(body)))
-        if chunk.uncompressed_size > _LARGEST_CHUNK or chunk.message_start_time != info.start:
+        start, end, size, checksum, length = _CHUNK_HEAD.unpack_from(body)
+        data = _CHUNK_HEAD.size + length + 8
+        if size > _LARGEST_CHUNK or start != info.start:
             return None
+        name = body[_CHUNK_HEAD.size : data - 8].decode()
+        (packed,) = struct.unpack_from("<Q", body, data - 8)
+        chunk = Chunk(name, body[data : data + packed], end, start, checksum, size)
         # The checksum is of the unpacked bytes, so damage in what unpacks well is found too.
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         content = stream.read(length)
     except Exception:  # zstandard and lz4 have errors of their own for what is damaged
         return None
-    return content if len(content) == chunk.uncompressed_size else None
+    return content if len(content) == size else None
 
 
 def _take_records(content: bytes, contents: Contents) -> Index | None:
@@ -312,6 +331,16 @@ class Container:
                 self._entries -= len(self._indexes.popitem(last=False)[1].times)
             return index
 
+    def part_of_index(self, info: ChunkInfo, channel: int) -> tuple[Numbers, Numbers] | None:
+        """Return the log times and places of a channel's messages in a chunk that has some; None if it is damaged.
+
+        Only what is about the channel is read where the file allows it: there may be hundreds of others.
+        """
+        with self._lock:
+            if info.map and info.number not in self._indexes:
+                return read_part(self._source, info, channel)
+            return self.index(info).of(channel)
+
     def _read_index(self, info: ChunkInfo) -> Index | None:
         """Return the index of a chunk, made of its content if the file has none; None if it is damaged."""
         if not info.index_length:
@@ -321,7 +350,7 @@ class Container:
             text = self._source.read(info.index, info.index_length)
             starts = index_places(self._source, info) if info.map else record_starts(text)
             index = parse_index(text, starts, info.start, info.end)
-        return index if index is not None and np.isin(index.channels, info.channels).all() else None
+        return index if index is not None and set(index.channels.tolist()) <= set(info.channels.tolist()) else None
 
     def message(self, ref: Ref) -> Message | None:
         """Return a message; None, and its chunk is left out, if it is damaged. Then find again what it was part of."""
@@ -358,170 +387,3 @@ class Container:
                 progress(info.number + 1, len(self.every_chunk))
         self.damaged += not self.damaged and self._messages not in (None, messages)
         return self.damaged
-
-
-# Finding messages by channel and time, reading as few chunks as possible.
-
-
-# A channel's number has 16 bits: arrays by channel have so many places.
-_CHANNELS = 1 << 16
-_BLOCK = 128
-"""Chunks of which it is noted together which channels they have: a list for each channel would be as long as the
-index of the whole file, and take seconds to make."""
-
-
-class Ref(NamedTuple):
-    """Where a message is, and its log time in ns.
-
-    The channel is last: of one instant, messages come in the order of the file, whatever numbers another tool has
-    given to the channels.
-    """
-
-    time: int
-    chunk: ChunkInfo
-    offset: int
-    channel: int
-
-
-class Totals(NamedTuple):
-    """How many messages a channel has, their bytes (with a few of framing), and the first and last log time in ns."""
-
-    messages: int = 0
-    bytes: int = 0
-    first: int = 0
-    last: int = 0
-
-
-class Timeline:
-    def __init__(self, container: Container) -> None:
-        self._container = container
-        self._chunks = container.every_chunk
-        # In order: chunks are numbered so.
-        self._starts = np.array([info.start for info in self._chunks], np.uint64)
-        self._ends = np.array([info.end for info in self._chunks], np.uint64)
-        # Chunks may overlap in time: when the last one up to a place ends.
-        self._all_end = np.maximum.accumulate(self._ends)
-        self._blocks: Numbers | None = None
-
-    def _holders(self, channel: int, before: int) -> Iterator[ChunkInfo]:
-        """Yield the chunks that have messages of a channel, from that with the number `before` - 1 backwards."""
-        if self._blocks is None:
-            blocks = np.zeros((-(-len(self._chunks) // _BLOCK), _CHANNELS), bool)
-            for info in self._chunks:
-                blocks[info.number // _BLOCK, info.channels] = True
-            self._blocks = blocks  # now and not before: another thread may use it
-        # Backwards, since the newest message before an instant is what is asked for most.
-        for block in np.flatnonzero(self._blocks[:, channel])[::-1].tolist():
-            for info in reversed(self._chunks[block * _BLOCK : min((block + 1) * _BLOCK, before)]):
-                if info.number not in self._container.lost and (info.channels == channel).any():
-                    yield info
-
-    def latest(self, channel: int, until: int, after: int = -1) -> Ref | None:
-        """Return the last message of a channel that is not later than `until` and later than `after`, or None."""
-        if until < 0:
-            return None
-        # No chunk from this one on has a message so early.
-        before = int(np.searchsorted(self._starts, np.uint64(until), side="right"))
-        best: Ref | None = None
-        for info in self._holders(channel, before):
-            # Neither this chunk nor one that begins before it has a later message.
-            if int(self._all_end[info.number]) <= after:
-                break
-            if info.end <= after:
-                continue
-            times, offsets = self._container.index(info).of(channel)
-            position = int(np.searchsorted(times, np.uint64(until), side="right")) - 1
-            if position >= 0 and int(times[position]) > after:
-                after = int(times[position])
-                best = Ref(after, info, int(offsets[position]), channel)
-        return best
-
-    def between(self, channels: Iterable[int], after: int, until: int) -> Iterator[Ref]:
-        """Yield the messages of some channels that are later than `after` and not later than `until`, by time."""
-        wanted = _mask(channels)
-        waiting: list[Ref] = []
-        for info in self._with(wanted, after, until):
-            # What is earlier than the beginning of the next chunk cannot be overtaken any more.
-            while waiting and waiting[0].time < info.start:
-                yield heapq.heappop(waiting)
-            waiting.extend(_inside(info, self._container.index(info), wanted, after, until))
-            heapq.heapify(waiting)
-        while waiting:
-            yield heapq.heappop(waiting)
-
-    def _with(self, wanted: Numbers, after: int, until: int) -> Iterator[ChunkInfo]:
-        """Yield the chunks between two instants that have messages of wanted channels, by their beginning."""
-        if until < 0:
-            return
-        inside = (self._ends > np.uint64(max(after, 0))) if after >= 0 else np.ones(len(self._chunks), bool)
-        for number in np.flatnonzero(inside & (self._starts <= np.uint64(until))).tolist():
-            info = self._chunks[number]
-            if number not in self._container.lost and wanted[info.channels].any():
-                yield info
-
-    def times(self, channels: Iterable[int]) -> Numbers:
-        wanted, found = _mask(channels), [np.empty(0, np.uint64)]
-        for info in self._with(wanted, -1, _END):
-            index = self._container.index(info)
-            found.append(index.times[wanted[index.entries()]])
-        return np.sort(np.concatenate(found))
-
-    def channels_between(self, after: int, until: int) -> set[int]:
-        found = np.zeros(_CHANNELS, bool)
-        for info in self._with(~found, after, until):
-            # A chunk that lies wholly inside: its list of channels says it all, and its index is not read.
-            if info.start > after and info.end <= until:
-                found[info.channels] = True
-            elif not found[info.channels].all():
-                index = self._container.index(info)
-                found[index.entries()[_between(index.times, after, until)]] = True
-        return set(np.flatnonzero(found).tolist())
-
-    def totals(self, progress: Progress | None = None) -> dict[int, Totals]:
-        messages, sizes, lasts = np.zeros((3, _CHANNELS), np.int64)
-        firsts = np.full(_CHANNELS, _END)
-        for info in self._chunks:
-            if info.number not in self._container.lost:
-                index = self._container.index(info)
-                entries, times = index.entries(), index.times.astype(np.int64)
-                np.add.at(messages, entries, 1)
-                np.add.at(sizes, entries, self._sizes(info, index))
-                np.minimum.at(firsts, entries, times)
-                np.maximum.at(lasts, entries, times)
-            if progress is not None:
-                progress(info.number + 1, len(self._chunks))
-        some = np.flatnonzero(messages).tolist()
-        figures = zip(*[each[some].tolist() for each in (messages, sizes, firsts, lasts)], strict=True)
-        return {channel: Totals(*each) for channel, each in zip(some, figures, strict=True)}
-
-    def _sizes(self, info: ChunkInfo, index: Index) -> Numbers:
-        """Return the bytes from each message of a chunk to the next of any channel."""
-        offsets = index.offsets.astype(np.int64)
-        # By place in the chunk, in which channels are mixed.
-        order = np.argsort(offsets)
-        sizes = np.empty(len(offsets), np.int64)
-        sizes[order] = np.diff(offsets[order], append=self._container.unpacked_size(info))
-        return np.maximum(sizes, 0)
-
-
-_END = 2**63 - 1
-
-
-def _mask(channels: Iterable[int]) -> Numbers:
-    wanted = np.zeros(_CHANNELS, bool)
-    wanted[list(channels)] = True
-    return wanted
-
-
-def _between(times: Numbers, after: int, until: int) -> Numbers:
-    begun = times > np.uint64(after) if after >= 0 else np.ones(len(times), bool)
-    return begun & (times <= np.uint64(until)) if until >= 0 else np.zeros(len(times), bool)
-
-
-def _inside(info: ChunkInfo, index: Index, wanted: Numbers, after: int, until: int) -> Iterator[Ref]:
-    """Yield the messages of a chunk that are of a wanted channel and between two instants, in any order."""
-    channels = index.entries()
-    chosen = wanted[channels] & _between(index.times, after, until)
-    columns = (index.times[chosen].tolist(), channels[chosen].tolist(), index.offsets[chosen].tolist())
-    for time, channel, offset in zip(*columns, strict=True):
-        yield Ref(time, info, offset, channel)

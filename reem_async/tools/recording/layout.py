@@ -28,7 +28,8 @@ from google.protobuf.message import DecodeError
 
 from ...errors import BadData
 from ...plan.documents import nested_over
-from ...plan.paths import Path, shorten
+from ...plan.paths import Path, related, shorten
+from ...plan.trees import MISSING, get
 from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip, flat
 from ...ships.registry import Ships
@@ -39,6 +40,7 @@ NOTES = "$ship"
 WRAPPER = "value"
 _DEEPEST = 128
 """Levels of a value. What is written has at most 100."""
+_MOST_NOTES = 64
 # Larger integers are not exact in JavaScript, in which most viewers are written.
 _LARGEST_EXACT = 2**53
 # Plain numbers and bools: what a short array in a message may be.
@@ -139,6 +141,50 @@ def from_json(text: bytes, *, wrapped: bool) -> Any:
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise DamagedRecording(f"the message {shorten(text)} was not written by REEM: {error!r}") from None
     return holder[0]
+
+
+class PathReader:
+    """Reads what is at one path below the root from many messages of a channel, without making a tree of each."""
+
+    def __init__(self, path: Path, *, wrapped: bool) -> None:
+        self._path = path
+        self._wrapped = wrapped
+        self._notes: dict[str, list[Any]] = {}  # those that concern the path, by the text that was at "$ship"
+
+    def read(self, texts: list[bytes]) -> list[Any] | None:
+        """Return the plain values or short arrays of some messages; None if one has something else, or is damaged."""
+        # Each level takes a bracket.
+        if max(map(len, texts)) >= 2 * _DEEPEST and max(map(_brackets, texts)) > _DEEPEST:
+            return None
+        try:
+            found = [self._value(root) for root in orjson.loads(b"[%b]" % b",".join(texts))]
+        except (LookupError, TypeError, ValueError, OverflowError):
+            return None
+        return found if len(found) == len(texts) else None
+
+    def _value(self, root: Any) -> Any:
+        notes = self._concerning(root[NOTES]) if NOTES in root else ()
+        value = get(root[WRAPPER] if self._wrapped else root, self._path)
+        if notes:
+            place, kind, *note = notes[0]
+            if kind != "array" or tuple(place) != self._path:
+                raise ValueError(notes)
+            return _array(value, *note)
+        if value is MISSING:
+            raise LookupError
+        return value
+
+    def _concerning(self, text: str) -> list[Any]:
+        if text not in self._notes:
+            if len(self._notes) >= _MOST_NOTES:
+                self._notes.clear()
+            found = [note for note in orjson.loads(text) if related(tuple(note[0]), self._path)]
+            self._notes[text] = found
+        return self._notes[text]
+
+
+def _brackets(text: bytes) -> int:
+    return text.count(b"{") + text.count(b"[")
 
 
 def _exact(shown: Any, kind: str, *note: Any) -> Any:

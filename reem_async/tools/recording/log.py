@@ -20,10 +20,11 @@ from ...ships.base import SpecialDatatypeShip
 from ...ships.registry import Ships, default_ships
 from ...transport.protocol import CommandRecorder
 from .align import CLOCKS, Alignment, at_rate, by_clock, stacked
-from .container import Container, Ref, Totals
+from .container import Container, Ref
 from .episodes import Episode, episodes_of
 from .format import NEWS, Role
 from .log_reader import RecordedPast, RecordedStream
+from .places import Totals
 from .stored import LOST, Reference, pruned, resolve
 from .times import Instant, before, nanoseconds, seconds, up_to
 
@@ -538,23 +539,42 @@ class LogPath:
             numbers; else a list. Instants at which nothing was there are left out, and so are values in
             which anything is damaged or was not recorded, which `Log.unreadable` counts.
         """
-        pairs = list(self.values(start, end, clock=clock))
-        times = np.array([time for time, _ in pairs], np.float64)
-        return times, stacked([value for _, value in pairs])
+        times: list[int] = []
+        values: list[Any] = []
+        for instants, found in self._read(start, end, clock):
+            times += instants
+            values += found
+        return np.array(times, np.int64).astype(np.float64) / 1e9, stacked(values)
 
     def values(
         self, start: Instant | None = None, end: Instant | None = None, *, clock: RecordedClock = "recorder"
     ) -> Iterator[tuple[float, Any]]:
         """Yield what `history` returns one by one, for what is larger than memory."""
+        for instants, found in self._read(start, end, clock):
+            yield from zip(map(seconds, instants), found, strict=True)
+
+    def _read(
+        self, start: Instant | None, end: Instant | None, clock: str
+    ) -> Iterator[tuple[Sequence[int], Sequence[Any]]]:
+        """Yield instants in ns and values, many at a time."""
         if clock not in ("recorder", "publisher"):
             raise BadValue(f"clock={clock!r:.40} is neither 'recorder' nor 'publisher'")
         after = -1 if start is None else before(start)
         until = _END if end is None else up_to(end)
-        for refs, repeats, tree in self._log._past.following(self.path, after, until):
-            ns = refs[0].time if clock == "recorder" else self._log._past.published(refs)
-            if repeats or ns is None or (whole := self._log._whole(tree)) is MISSING:
-                continue
-            yield seconds(ns), whole
+        past = self._log._past
+        if clock == "recorder":
+            for instants, trees, is_plain in past.batches(self.path, after, until):
+                if is_plain:
+                    yield instants, trees
+                    continue
+                for ns, tree in zip(instants, trees, strict=True):
+                    if (whole := self._log._whole(tree)) is not MISSING:
+                        yield [ns], [whole]
+            return
+        for refs, repeats, tree in past.following(self.path, after, until):
+            published = past.published(refs)
+            if not repeats and published is not None and (whole := self._log._whole(tree)) is not MISSING:
+                yield [published], [whole]
 
     def __repr__(self) -> str:
         return f"<{show(self.path)} of {self._log!r}>"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,10 +18,11 @@ from ...plan.paths import Path, Pattern, below, related
 from ...plan.trees import MISSING, get, same
 from ...ships.images import EncodedImage
 from ...ships.registry import Ships
-from .container import Container, Ref, Timeline
+from .container import Container, Ref
 from .foreign import Foreign
 from .format import NEWS, DamagedRecording, Kind, Role
-from .layout import decode, from_json
+from .layout import PathReader, decode, from_json
+from .places import Timeline, messages_in
 from .sink import CHANNELS
 from .stored import LOST, Reference, applied, opened, reference_to
 
@@ -264,16 +265,17 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             if value is not _DAMAGED:
                 yield ref, stream, value
 
-    def following(self, path: Path, after: int, until: int) -> Iterator[tuple[list[Ref], bool, Any]]:
+    def following(
+        self, path: Path, after: int, until: int, last: Any = MISSING
+    ) -> Iterator[tuple[list[Ref], bool, Any]]:
         """Yield the news on a full path of each instant, whether it only repeats, and what was there after it.
 
-        If a part of the file is damaged, keyframes are news too.
+        `last` is what was there before, if that is known. If a part of the file is damaged, keyframes are news too.
         """
         anchor, streams = self._anchor(path), self._streams_of(path)
         roles = (*NEWS, Role.KEYFRAME)
         chosen = [it for it in streams if it.role in roles and related(it.path, anchor)]
         tree = self.tree(anchor, after) if chosen and after >= 0 else MISSING
-        last: Any = MISSING
         for refs in self._instants([each for it in chosen for each in it.channels], after, until):
             is_read, is_whole = False, True
             for ref in refs:
@@ -294,9 +296,73 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
 
     def changes(self, path: Path, after: int, until: int = 2**63 - 1) -> Iterator[tuple[int, Any]]:
         """Yield the instants (ns) of news on a full path, and what was there, MISSING if nothing was."""
-        for refs, repeats, tree in self.following(path, after, until):
-            if not repeats:
-                yield refs[0].time, tree
+        for ns, tree, _ in self.values(path, after, until):
+            yield ns, tree
+
+    def values(self, path: Path, after: int, until: int) -> Iterator[tuple[int, Any, bool]]:
+        """Yield what `changes` does, and whether it is a plain value, without any `Reference`."""
+        for times, trees, is_plain in self.batches(path, after, until):
+            yield from zip(times, trees, itertools.repeat(is_plain))
+
+    def batches(self, path: Path, after: int, until: int) -> Iterator[tuple[list[int], list[Any], bool]]:
+        """Yield what `values` does, many at a time."""
+        stopped = yield from self._written_whole(path, after, until)
+        if stopped is not None:
+            for refs, repeats, tree in self.following(path, stopped[0], until, stopped[1]):
+                if not repeats:
+                    yield [refs[0].time], [tree], False
+
+    def _written_whole(
+        self, path: Path, after: int, until: int
+    ) -> Generator[tuple[list[int], list[Any], bool], None, tuple[int, Any] | None]:
+        """Yield what `batches` does, as long as each message has all that is at the path, and is sound.
+
+        Most numbers are recorded so. A chunk is read at a time, and only what is at the path is made of a message.
+        Returns the last instant, and what was there then, if something else follows; else None.
+        """
+        roles = (*NEWS, Role.KEYFRAME) if self._container.damaged or self._has_skipped else NEWS
+        streams = [it for it in self._streams_of(path) if it.role in roles and related(it.path, path)]
+        at, last = after, MISSING
+        is_whole = self._anchor(path) == path and all(len(it.path) <= len(path) for it in streams)
+        if not is_whole or self.foreign is not None:
+            return at, last
+        readers = {channel: self._reader(channel, path) for it in streams for channel in it.channels}
+        for batch in self.timeline.batches(readers, after, until):
+            content = None if batch is None else self._container.content(batch.chunk)
+            if batch is None or content is None:
+                return at, last
+            channel = int(batch.channels[0])
+            reader, stream = readers[channel], self.of_channel[channel]
+            if reader is not None and stream.role == Role.UPDATE and (batch.channels == channel).all():
+                texts = messages_in(content, batch)
+                trees = None if texts is None else reader.read(texts)
+                if trees is not None:
+                    times = batch.times.tolist()
+                    at, last = times[-1], trees[-1]
+                    yield times, trees, True
+                    continue
+            rows = zip(batch.times.tolist(), batch.channels.tolist(), batch.offsets.tolist(), strict=True)
+            for time, channel, offset in rows:
+                stream = self.of_channel[channel]
+                try:
+                    whole = self._load(Ref(time, batch.chunk, offset, channel), stream)
+                except (_FoundDamage, BadData):
+                    return at, last
+                tree = self._inside(whole, path[len(stream.path) :])
+                # See `following`.
+                repeats = stream.role in (Role.STATE, Role.KEYFRAME) and tree is not MISSING and last is not MISSING
+                repeats = repeats and same(tree, last)
+                at, last = time, tree
+                if not repeats:
+                    yield [time], [tree], False
+        return None
+
+    def _reader(self, channel: int, path: Path) -> PathReader | None:
+        """Return what reads a path in the messages of a channel; None if they are no JSON, or deletions."""
+        stream, it = self.of_channel[channel], self._container.channels[channel]
+        if it.message_encoding != "json" or stream.role == Role.DELETE:
+            return None
+        return PathReader(path[len(stream.path) :], wrapped="reem.wrapped" in it.metadata)
 
     def published_at(self, path: Path, ns: int) -> int:
         """Return when the news on a path of an instant was published (ns), or that instant if it was not."""

@@ -266,6 +266,22 @@ def index_places(source: Source, info: ChunkInfo) -> Numbers:
     return np.sort(np.frombuffer(text, _PLACE)["offset"].astype(np.int64)) - info.index
 
 
+def read_part(source: Source, info: ChunkInfo, channel: int) -> tuple[Numbers, Numbers] | None:
+    """Return the log times and places of a channel's messages by the index of a chunk; None if it is damaged."""
+    places = np.frombuffer(source.read(info.map, len(info.channels) * _PLACE.itemsize), _PLACE)
+    place = int(places["offset"][places["channel"] == channel][0])
+    if not info.index <= place <= info.index + info.index_length - _INDEX_HEAD.itemsize:
+        return None
+    head = np.frombuffer(source.read(place, _INDEX_HEAD.itemsize), _INDEX_HEAD)[0]
+    size, start = int(head["size"]), place + _INDEX_HEAD.itemsize
+    is_sound = head["opcode"] == Opcode.MESSAGE_INDEX and head["channel"] == channel and head["length"] == size + 6
+    if not is_sound or size % 16 or start + size > info.index + info.index_length:
+        return None
+    pairs = np.frombuffer(source.read(start, size), "<u8").reshape(-1, 2)
+    times, offsets = pairs[:, 0], pairs[:, 1]
+    return (times, offsets) if not len(times) or info.start <= times.min() <= times.max() <= info.end else None
+
+
 def index_of(channels: Any, times: Any, offsets: Any) -> Index:
     """Return the index of messages, given the channel, the log time and the place of each, in any order."""
     numbers, stamps, places = np.array(channels, np.uint16), np.array(times, np.uint64), np.array(offsets, np.uint64)

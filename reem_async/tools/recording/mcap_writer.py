@@ -3,6 +3,10 @@
 The records are the library's, and its readers read the file. What its own writer does not offer is done
 here: a message is not copied on its way into a chunk, a chunk is compressed at level 1 of zstd (a fifth of
 the time, hardly a byte more), and all of it in slices, giving way to the programs that are recorded.
+
+Two chunks are open at a time, for small messages and for large ones, so that numbers are read without the pictures
+between them. When small messages are written, the large ones so far are written first: a message refers to earlier
+ones only.
 """
 
 from __future__ import annotations
@@ -26,6 +30,8 @@ from .output import Output, slices
 
 # Bytes after which a chunk is closed: large enough to compress well, small enough to be unpacked for one message.
 _CHUNK_BYTES = 1 << 20
+LARGE_BYTES = 1 << 13
+"""Bytes from which a message goes to the chunks of large ones. A message of numbers has a few hundred."""
 _INDEX_BYTES = 1 << 20
 """Bytes of the index of chunks that are kept in memory; the rest of it waits in a file without a name."""
 _MESSAGE_FIELDS = MESSAGE.size - HEAD.size
@@ -65,9 +71,14 @@ COMPRESSIONS: dict[str, tuple[str, Callable[[int], _Stream]]] = {
 
 
 class _Chunk:
-    """The messages since the last chunk was closed, behind the schemas and channels that are new."""
+    """The messages since the last chunk of its kind was closed, behind the schemas and channels that are new in those.
 
-    def __init__(self) -> None:
+    Such records may be repeated, and must come before the first message that needs them. A chunk of the other kind may
+    be written later, or be damaged.
+    """
+
+    def __init__(self, described: set[tuple[Opcode, int]]) -> None:
+        self.described = described  # schemas and channels that are in earlier chunks of this kind, or in this one
         self.pieces: list[Any] = []
         self.size = 0
         self.index: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)  # log time and place of each message
@@ -92,7 +103,7 @@ class McapWriter:
     def __init__(self, output: Output, compression: str, library: str) -> None:
         self._output = output
         self._name, self._compressor = COMPRESSIONS[compression]
-        # Schemas and channels are written where they are first used, and again in the summary.
+        # Schemas and channels are written before their first use, and again in the summary.
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
         # It grows with chunks times channels, 40 KB a second for a thousand keys: never in memory as a whole.
@@ -101,13 +112,12 @@ class McapWriter:
         self._first, self._last = _NEVER, 0
         self._metadata: list[records.MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
-        self._chunk = _Chunk()
+        self._small, self._large = _Chunk(set()), _Chunk(set())
         output.write(MAGIC + _record(records.Header("", library)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         schema = records.Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
         self._schemas.append(schema)
-        self._chunk.put(_record(schema))
         return schema.id
 
     def register_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
@@ -115,24 +125,35 @@ class McapWriter:
             id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema, metadata=metadata
         )
         self._channels.append(channel)
-        self._chunk.put(_record(channel))
         return channel.id
 
     def add_message(self, channel: int, log_time: int, pieces: list[Any], publish_time: int, number: int) -> int:
-        """Put a message into the chunk, and close that if it is large enough; returns its bytes. Times are in ns.
+        """Put a message into a chunk, and write that if it is large enough; returns its bytes. Times are in ns.
 
         Pieces are bytes, or views of bytes that do not change.
         """
         size = sum(map(len, pieces))
+        chunk = self._large if size >= LARGE_BYTES else self._small
+        self._describe(channel, chunk)
         head = MESSAGE.pack(
             Opcode.MESSAGE, _MESSAGE_FIELDS + size, channel, number & 0xFFFFFFFF, log_time, publish_time
         )
-        self._chunk.put_message(channel, log_time, head, *pieces)
+        chunk.put_message(channel, log_time, head, *pieces)
         self._counts[channel] += 1
         # After the message and not before it: no message is split, however large.
-        if self._chunk.size > _CHUNK_BYTES:
-            self._close_chunk()
+        if chunk.size > _CHUNK_BYTES:
+            self._close_chunks(with_small=chunk is self._small)
         return size
+
+    def _describe(self, channel: int, chunk: _Chunk) -> None:
+        """Put the records of a channel into a chunk, unless an earlier one of its kind has them."""
+        record = self._channels[channel - 1]
+        if (Opcode.CHANNEL, channel) in chunk.described:
+            return
+        if (Opcode.SCHEMA, record.schema_id) not in chunk.described:
+            chunk.put(_record(self._schemas[record.schema_id - 1]))
+        chunk.put(_record(record))
+        chunk.described |= {(Opcode.CHANNEL, channel), (Opcode.SCHEMA, record.schema_id)}
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
         """Write a metadata record, behind the chunks closed so far."""
@@ -141,12 +162,12 @@ class McapWriter:
         self._output.write(record)
 
     def flush(self) -> None:
-        """Close the chunk, if there is a message in it, and hand everything to the operating system."""
-        self._close_chunk()
+        """Close the chunks that have messages, and hand everything to the operating system."""
+        self._close_chunks()
         self._output.flush()
 
     def finish(self) -> None:
-        self._close_chunk()
+        self._close_chunks()
         # 0: no checksum of the data section, which would be of hours of data; each chunk has its own.
         self._output.write(_record(records.DataEnd(0)))
         start = self._output.tell()
@@ -199,11 +220,17 @@ class McapWriter:
             schema_count=len(self._schemas),
         )
 
-    def _close_chunk(self) -> None:
-        chunk = self._chunk
+    def _close_chunks(self, *, with_small: bool = True) -> None:
+        # The large ones first: small messages refer to them.
+        self._close_chunk(self._large)
+        self._large = _Chunk(self._large.described)
+        if with_small:
+            self._close_chunk(self._small)
+            self._small = _Chunk(self._small.described)
+
+    def _close_chunk(self, chunk: _Chunk) -> None:
         if not chunk.index:
             return
-        self._chunk = _Chunk()
         # All sizes must be known before the head is written, so a chunk is compressed in memory first.
         checked, data = self._compressed(chunk)
         size, start, name = sum(map(len, data)), self._output.tell(), self._name.encode()

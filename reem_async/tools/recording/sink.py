@@ -29,7 +29,7 @@ from .output import Output
 
 FORMAT = "1"
 FLUSH_SECONDS = 0.25
-"""Seconds after which a chunk is closed and given to the operating system, however small it is."""
+"""Seconds after which chunks are closed and given to the operating system, however small they are."""
 
 _MOST_CHANNELS = 60_000
 """MCAP numbers them with 16 bits."""
@@ -77,7 +77,7 @@ class Sink:
         self._known: dict[Any, list[tuple[Schema, int]]] = {}
         self._count = 0
         self._new: list[Any] = []
-        # When the last chunk was closed, and how many messages wait in the open one.
+        # When the chunks were closed last, and how many messages came since then.
         self._closed_at = time.monotonic()
         self._open = 0
 
@@ -147,7 +147,7 @@ class Sink:
         return self._writer.add_message(channel, log_time, pieces, max(publish_time, 0), number)
 
     def tick(self) -> None:
-        """Close the chunk if it is time, so that it can be read whatever happens."""
+        """Close the chunks if it is time, so that they can be read whatever happens."""
         if time.monotonic() - self._closed_at >= FLUSH_SECONDS:
             self._closed_at = time.monotonic()
             if self._open:

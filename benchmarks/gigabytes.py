@@ -1,0 +1,111 @@
+"""A recording of gigabytes: written at once, and how long the library and the page take over it.
+
+    python -m benchmarks.gigabytes write /tmp/run.mcap --gigabytes 3     a robot's rates, without waiting for them
+    python -m benchmarks.gigabytes library /tmp/run.mcap                 first keys, one number's history, memory
+    python -m benchmarks.gigabytes page /tmp/run.mcap --actions 50       the same in Chromium: slider and plots
+
+`write` and `library` run on earlier commits too: put the commit's tree first on PYTHONPATH.
+"""
+
+import argparse
+import math
+import pathlib
+import resource
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from reem_async.ships.registry import Ships, default_ships
+from reem_async.tools.recording import open_log
+from reem_async.tools.recording.format import Role
+from reem_async.tools.recording.sink import FLUSH_SECONDS, Sink
+from reem_async.tools.recording.writer_thread import Operation, WriterThread
+from reem_async.transport.protocol import CommandRecorder
+
+_START = 1_700_000_000_000_000_000
+_TICK = 5_000_000  # ns: the fastest rate is 200 Hz
+_KEYFRAME = 1000  # ticks: 5 s, as the recorder's
+_FRAMES = 8  # different pictures, of noise: they do not become smaller
+PLOTTED = ("arm.q", "battery.voltage", "imu.gyro", "camera.t", "base.x")
+
+
+def _values(tick: int, frames: list[Any], points: list[Any]) -> Iterator[tuple[str, Any]]:
+    """Yield what a robot publishes in one tick: an arm and an IMU at 200 Hz, a base at 50 Hz, two sensors at 10 Hz."""
+    t = tick * _TICK / 1e9
+    joints = [math.sin(t * (joint + 1)) for joint in range(7)]
+    yield "arm", {"q": joints, "dq": [math.cos(each) for each in joints], "t": t}
+    yield "imu", {"gyro": joints[:3], "acceleration": joints[3:6], "n": tick}
+    if tick % 4 == 0:
+        yield "base", {"x": t, "y": joints[0], "theta": joints[1], "mode": "drive"}
+    if tick % 20 == 0:
+        yield "camera", {"t": t, "exposure": 0.01, "rgb": frames[tick // 20 % len(frames)]}
+        yield "lidar", {"t": t, "points": points[tick // 20 % len(points)]}
+    if tick % 200 == 0:
+        yield "battery", {"voltage": 24.0 - t / 3600, "state": "discharging"}
+
+
+def write(file: pathlib.Path, size: float) -> None:
+    """Write a recording of about so many bytes, with the recorder's own writer and at its pace of flushes."""
+    began, rng = time.perf_counter(), np.random.default_rng(1)
+    frames = [rng.integers(0, 256, (480, 640, 3), np.uint8) for _ in range(_FRAMES)]
+    points = [rng.random((2000, 4), np.float32) for _ in range(_FRAMES)]
+    sink = Sink(file, "zstd", {"version": "benchmark"}, overwrite=True)
+    sink.output.appear()
+    writer, tick, names = WriterThread(sink, Ships(default_ships(), CommandRecorder), 0), 0, set()
+    while sink.output.tell() < size:
+        at, now = 0, _START + tick * _TICK
+        for at, (name, value) in enumerate(_values(tick, frames, points)):
+            stamp = now + at * 2000
+            names.add(name)
+            writer._write(Operation(Role.UPDATE, (name,), value, (stamp, stamp - 100_000, tick + 1)))
+        if tick % _KEYFRAME == 0:
+            for name in sorted(names):
+                at += 1
+                writer._write(Operation(Role.KEYFRAME, (name,), None, (now + at * 2000, 0, 0)))
+        tick += 1
+        if tick * _TICK % int(FLUSH_SECONDS * 1e9) == 0:
+            sink._closed_at = -FLUSH_SECONDS
+            sink.tick()
+    sink.finish({})
+    took = time.perf_counter() - began
+    print(f"{file}: {file.stat().st_size / 1e9:.2f} GB, {tick * _TICK / 1e9:.0f} s of a robot, written in {took:.0f} s")
+
+
+def _timed(what: str, work: Callable[[], Any]) -> Any:
+    began = time.perf_counter()
+    found = work()
+    print(f"{what:48} {time.perf_counter() - began:8.3f} s")
+    return found
+
+
+def library(file: pathlib.Path) -> None:
+    """Print what the library takes: each history in a log that was just opened."""
+    log = _timed("open_log, names", lambda: (log := open_log(file), log.names())[0])
+    _timed("tree_at the end", lambda: log.tree_at(log.end))
+    middle = log.start + log.duration / 2
+    _timed("tree_at the middle", lambda: log.tree_at(middle))
+    log.close()
+    for path in PLOTTED:
+        with open_log(file) as log:
+            times, _ = _timed(f"history of {path}", log[path].history)
+            print(f"{'':48} {len(times)} values")
+    print(f"{'largest memory of the process':48} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:8.0f} MB")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("write", "library", "page"))
+    parser.add_argument("file", type=pathlib.Path)
+    parser.add_argument("--gigabytes", type=float, default=3.0)
+    parser.add_argument("--actions", type=int, default=50)
+    given = parser.parse_args()
+    if given.what == "write":
+        write(given.file, given.gigabytes * 1e9)
+    elif given.what == "library":
+        library(given.file)
+
+
+if __name__ == "__main__":
+    main()
