@@ -11,8 +11,10 @@ from browserkit import client_of, live, served
 from conftest import eventually, repeated
 from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
 
+from reem import PublishSpace, RedisInterface
 from reem.server import EmbeddedServer
 from reem_async.errors import RemoteError
+from reem_async.plan.keys import keys_of
 from reem_async.tools.browser.history import History
 from reem_async.tools.browser.trees import differing
 
@@ -102,9 +104,18 @@ def test_a_server_that_died_greys_the_page_and_is_told_in_plain_words(chromium, 
         expect(page.locator("#banner")).to_have_attribute("title", re.compile("no server answers"))
         assert page.evaluate(live_colour) != green
         assert "grayscale" in page.evaluate("getComputedStyle(document.querySelector('main')).filter")
-        with EmbeddedServer(port, tmp_path / "data"):
+        with EmbeddedServer(port, tmp_path / "data") as again:
             expect(page.locator("#banner")).to_be_hidden()
             assert page.evaluate(live_colour) == green
+            with RedisInterface(again.url) as interface, client_of(address) as ask:
+                space = PublishSpace(interface)
+                space["n"] = 1
+                eventually(lambda: "n" in ask.rows())
+                (gap,) = ask.json("series", path="n", start=0)["losses"]
+                assert gap[0] < gap[1]
+                interface._core.session.stamp(keys_of("n"))
+                space["n"] = 2
+                eventually(lambda: ask.json("series", path="n")["losses"][-1][2] == 1)
     expect(page.locator("#banner")).to_contain_text("reem browse")
     others = ("Failed to load", "ERR_")  # what the browser itself says of a lost connection
     assert not [it for it in visitor.said if it.startswith("error: ") and not any(each in it for each in others)]
@@ -149,6 +160,91 @@ def test_the_labels_of_a_nearly_constant_plot_differ(visit):
         labels = page.evaluate(LABELS, values)
         assert len(labels) >= 2
         assert len(set(labels)) == len(labels), labels
+
+
+GAP = """async () => {
+  const { Plot } = await import("/static/plot.js");
+  const box = document.createElement("div");
+  box.style.cssText = "position: fixed; inset: 0";
+  document.body.append(box);
+  const axis = { plots: new Set(), full: [0, 10], shown: null, hover: null };
+  const plot = new Plot(box, { axis });
+  plot.set({ names: [""], times: [0, 9], lines: [[1, 1]], start: 0, end: 10, losses: [[4, 6, 3]], quiet: [[0, 3]] });
+  const { x, y } = plot.place(plot.width, plot.height), ratio = plot.ratio;
+  const blue = getComputedStyle(box).getPropertyValue("--curve-0");
+  const colour = [1, 3, 5].map((at) => parseInt(blue.slice(at, at + 2), 16));
+  const { width, height } = plot.canvas, copy = Object.assign(document.createElement("canvas"), { width, height });
+  const copied = copy.getContext("2d", { willReadFrequently: true });
+  copied.drawImage(plot.canvas, 0, 0);
+  const drawn = (from, to) => {
+    const across = Math.round((x(to) - x(from)) * ratio), top = Math.round((y(1) - 2) * ratio);
+    const { data } = copied.getImageData(Math.round(x(from) * ratio), top, across, 4);
+    const near = (at) => colour.every((part, index) => Math.abs(data[at * 4 + index] - part) < 40);
+    const columns = Array.from({ length: across }, (_, at) => [0, 1, 2, 3].some((up) => near(up * across + at)));
+    return columns.filter(Boolean).length / across;
+  };
+  const parts = { whole: drawn(7, 8), lost: drawn(4.5, 5.5), quiet: drawn(1, 2) };
+  return { ...parts, said: plot.where(5), note: plot.note.textContent };
+}"""
+
+
+def test_a_plot_has_a_gap_where_updates_were_lost_and_dots_where_none_came(visit):
+    """An outage was a flat line, as if the value had been the same."""
+    drawn = visit.open("/").evaluate(GAP)
+    assert drawn["whole"] == 1
+    assert drawn["lost"] == 0
+    assert 0.1 < drawn["quiet"] < 0.9
+    assert "3 updates lost" in drawn["said"]
+    assert "updates were lost" in drawn["note"]
+    assert "no update came" in drawn["note"]
+
+
+@pytest.mark.long
+def test_plots_zoom_together_share_a_cursor_and_take_other_keys(visit, pspace, key):
+    for number in range(25):
+        pspace[key()] = {"x": float(number), "y": number - 12.0}
+        time.sleep(0.03)
+    page = visit.open(f"/view/{key()}")
+    plots, legends = page.locator(".pane canvas"), page.locator(".pane .legend")
+    expect(plots).to_have_count(2)
+    everything = page.get_by_role("button", name="Show all of it again")
+    expect(everything).to_have_count(0)
+    box = plots.nth(0).bounding_box()
+    plots.nth(0).hover(position={"x": box["width"] - 20, "y": 50})
+    expect(legends.nth(1)).to_have_text(re.compile(r"-?\d"))  # the cursor is in all plots
+    with page.expect_request(lambda request: "/api/series" in request.url and "start=" in request.url):
+        page.keyboard.down("Control")
+        page.mouse.wheel(0, -200)
+        page.keyboard.up("Control")
+    expect(everything).to_have_count(2)
+    everything.nth(1).click()
+    expect(everything).to_have_count(0)
+    box = page.locator("#activity").bounding_box()
+    page.locator("#activity").hover(position={"x": box["width"] - 4, "y": 5})
+    expect(legends.nth(0)).to_have_text(re.compile(r"\d"))  # and the slider's strip moves it
+
+    page = visit.open(f"/view/{key()}.y")
+    page.get_by_role("button", name="Logarithmic axis").click()
+    expect(page.locator(".plot-note")).to_contain_text("no place on a log axis")
+    for _ in range(2):
+        expect(page.get_by_role("button", name="Logarithmic axis")).to_have_attribute("aria-pressed", "true")
+        page.reload()
+    page.get_by_role("button", name="Draw another key in this plot").click()
+    page.get_by_label("Key to draw in this plot").fill(f"{key()}.x")
+    page.keyboard.press("Enter")
+    lines = page.locator(".legend button[aria-pressed]")
+    expect(lines).to_have_text([re.compile(rf"^{key()}\.{name} ") for name in "yx"])
+    box = page.locator("canvas.plot").bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.6, box["y"] + 110, steps=3)
+    page.mouse.up()
+    everything = page.get_by_role("button", name="Show all of it again")
+    expect(everything).to_be_visible()
+    expect(page.locator("#live")).to_have_attribute("aria-pressed", "true")  # dragging is no click
+    page.keyboard.press("0")
+    page.get_by_role("button", name=f"Take {key()}.x out of this plot").click()
+    expect(lines).to_have_count(0)
 
 
 @pytest.mark.long

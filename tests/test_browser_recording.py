@@ -9,6 +9,7 @@ from conftest import aeventually, python
 
 import reem_async
 from reem_async.errors import ReadOnly
+from reem_async.plan.keys import keys_of
 from reem_async.server import EmbeddedServer
 from reem_async.tools.browser.logsource import LogSource
 from reem_async.tools.recording import Recorder
@@ -30,6 +31,7 @@ async def record(path):
                     await aeventually(lambda before=before: recorder.status.messages > before + 1)
                     await asyncio.sleep(0.05)
                     times.append(asyncio.get_running_loop().time())
+                interface.session.stamp(keys_of("arm"))  # an update that is lost
                 await pspace["arm"]["mode"].write("done")
                 await pspace["cam"].delete()
                 await asyncio.sleep(0.1)
@@ -81,6 +83,17 @@ def test_the_span_and_the_changes_in_it(ask, steps):
 def test_series_and_search(ask, steps):
     assert ask.json("series", path="arm.q")["lines"][0][-5:] == [1.0, 2.0, 3.0, 4.0, 5.0]
     assert [row["address"] for row in ask.json("search", q="q")["found"]] == ["arm.q", "arm.q[0]", "arm.q[1]"]
+
+
+def test_lost_updates_are_marked_in_series(ask, steps):
+    said = ask.json("series", path="arm.q")
+    ((start, end, missed),) = said["losses"]
+    assert steps[4] - 0.02 < start < end <= said["end"]
+    assert missed == 1
+    assert ask.json("series", path="cam.step")["losses"] == []
+    part = ask.json("series", path="arm.q", start=steps[1], end=steps[3])
+    assert (part["start"], part["end"], part["losses"]) == (steps[1], steps[3], [])
+    assert part["lines"][0] == [2.0, 3.0, 4.0]
 
 
 def test_the_snippet_reads_that_very_instant(ask, steps):

@@ -24,7 +24,7 @@ from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import walk
 from ..jsontext import json_text
-from .source import Node, NotKept, Series, Source, address, path_of, thinned, visible
+from .source import Node, NotKept, Series, Source, address, path_of, silences, thinned, visible
 from .trees import CONTENTS
 
 # Requests: parameters are checked, and errors become answers with the right status.
@@ -149,13 +149,14 @@ def same_origin(headers: Headers) -> bool:
 
 
 # What one question of a page may ask for, so that no page keeps the program from answering others: open branches of the
-# tree, rows of one and of all of them, paths that are marked as changed, points of a curve, paths that a search names,
-# and characters of a text.
+# tree, rows of one and of all of them, paths that are marked as changed, points of a curve, losses that
+# are marked in it, paths that a search names, and characters of a text.
 _MOST_BRANCHES = 100
 _MOST_ROWS = 1000
 _MOST_ROWS_IN_ALL = 3000
 _MOST_MARKS = 5000
 _MOST_POINTS = 1200
+_MOST_LOSSES = 500
 _MOST_FOUND = 60
 _LONGEST_TEXT = 200_000
 _MOST_PARAMETERS = 200
@@ -234,8 +235,11 @@ class Api:
         status = self._source.status()
         start, end = number_of(request, "start"), number_of(request, "end")
         start = status.start if start is None else start
-        found = await self._source.series(value_path_in(request), start, status.end if end is None else end)
-        return reply({"start": start, "end": status.end if end is None else end, **_thinned(found)._asdict()})
+        end, path = status.end if end is None else min(end, status.end), value_path_in(request)
+        found = await self._source.series(path, start, end)
+        losses = await self._source.losses(path, start, end) if found.times else []
+        marks = {"losses": [tuple(loss) for loss in losses[-_MOST_LOSSES:]], "quiet": silences(found.times, end)}
+        return reply({"start": start, "end": end, **_thinned(found)._asdict(), **marks})
 
     async def activity(self, request: Request) -> Response:
         status = self._source.status()

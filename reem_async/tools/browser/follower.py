@@ -30,6 +30,7 @@ from ...pubsub.monitor import ANNOUNCED, Event, Monitor
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer, find_regularly, present_keys
 from ...store.document import opened
 from .history import LARGEST_TEXT, History
+from .source import Loss
 from .timeline import PENDING
 from .trees import framed, is_kept, same, weight
 
@@ -279,7 +280,7 @@ class Follower:
         self.arrays = Allowance(BACKGROUND_RATE * UNSEEN, history.budget / 2)  # bytes of arrays that may be read
         self.monitor = Monitor(interface, policy=Last(_WAITING), raw=True)
         self.monitor.invalidated = lambda name: self.key(name).doubt()
-        self.monitor.broken, self.monitor.changed = self._lost, self._changed
+        self.monitor.broken, self.monitor.changed = self._broken, self._changed
         self.monitor.resynchronised = self._read_again
         self._tasks: list[asyncio.Task[None]] = []
         self._keys: dict[str, FollowedKey] = {}
@@ -354,6 +355,9 @@ class Follower:
             if not self.history.knows(name) and name not in self.unread:
                 self.history.begin(name, None)
         when = self.history.clock.of(event.received)
+        if event.gap:
+            since = self.history.last([(name,)], when).get((name,), when)
+            self.history.losses.add(name, Loss(since, when, event.missed or None))
         value = MISSING if event.deleted else PENDING if event.value is ANNOUNCED else event.value
         self.history.add(event.path, value, 0 if value is PENDING else event.size, when)
         self.key(name).hear(event)
@@ -373,6 +377,10 @@ class Follower:
             if key.feed.change(server_key):
                 key.looks.ask()
 
+    def _broken(self) -> None:
+        self.history.losses.begin(self.history.clock.now())
+        self._lost()
+
     def _lost(self) -> None:
         """Note that changes may be unknown: the connection that reports them is lost."""
         for key in self._keys.values():
@@ -385,6 +393,7 @@ class Follower:
         `_lost` is not called for a connection that breaks before its topics are subscribed, though keys may have been
         touched over it. The next search may be seconds away: it waits ten times as long as the last one took.
         """
+        self.history.losses.finish(self.history.clock.now())
         self._lost()
         self.read_soon(self.names | self._keys.keys())
 

@@ -15,7 +15,7 @@ from typing import Any
 from ...plan.paths import Path, related
 from ...plan.placeholders import Unfetched
 from ...plan.trees import MISSING, difference, walk
-from .source import rate_span
+from .source import Loss, rate_span
 from .timeline import UNKNOWN, BufferedChange, BufferedPast, Kept
 from .trees import Frame, same, weight
 
@@ -147,6 +147,44 @@ def _has_both(frame: Frame) -> bool:
     return frame.whole is not None and frame.preview is not None
 
 
+# What was lost of updates.
+
+_MOST_LOSSES = 5000  # that are kept: the oldest go
+
+
+class Losses:
+    """When updates were lost of a key, or of all while the server could not be reached."""
+
+    def __init__(self) -> None:
+        self._all: deque[tuple[str, Loss]] = deque(maxlen=_MOST_LOSSES)  # the key; "" for all
+        self._away: float | None = None  # since when nothing is received
+
+    def add(self, name: str, loss: Loss) -> None:
+        # After an outage the first update of each key reports a loss: that is known.
+        last = next((whose for whose, _ in reversed(self._all) if whose in ("", name)), None)
+        if loss.missed is not None or last != "":
+            self._all.append((name, loss))
+
+    def begin(self, when: float) -> None:
+        if self._away is None:
+            self._away = when
+
+    def finish(self, when: float) -> None:
+        if self._away is not None:
+            self.add("", Loss(self._away, when, None))
+            self._away = None
+
+    def forget(self, start: float) -> None:
+        while self._all and self._all[0][1].end < start:
+            self._all.popleft()
+
+    def of(self, name: str, start: float, end: float) -> list[Loss]:
+        found = [loss for whose, loss in self._all if whose in ("", name)]
+        if self._away is not None:
+            found.append(Loss(self._away, math.inf, None))
+        return [loss._replace(end=min(loss.end, end)) for loss in found if loss.end >= start and loss.start <= end]
+
+
 # The buffer.
 
 Text = bytes
@@ -165,6 +203,7 @@ class History:
         self.clock = BufferClock()  # the time of all that is in it
         self.start = self.clock.now()  # from when on the past is known, in seconds since 1970
         self.frames = Frames(seconds)  # the arrays that were read
+        self.losses = Losses()
         self.dropped = 0  # how many changes had to go before their time
         self._bytes = 0  # of all but the frames
         self._lines: dict[str, BufferedPast] = {}
@@ -240,6 +279,7 @@ class History:
             self._trimmed = when
             self._fold(sum(1 for _ in takewhile(lambda change: change.time < when - self.seconds, self._all)))
             self.start = max(self.start, when - self.seconds)
+            self.losses.forget(self.start)
             self.frames.forget(self.start, lambda path: isinstance(self.tree(path, when), Frame | Unfetched))
         if self.bytes > self.budget:
             # Pictures go first, thinned evenly; but not below half of all memory for the sake of plain values.

@@ -22,7 +22,7 @@ from .follower import Follower
 from .history import History
 from .partial_reads import keys_at, peek
 from .raw import RawFollower
-from .source import Node, NotKept, Page, Sample, Series, Status, counted, matching, node_of, numbers_in, snippets
+from .source import Loss, Node, NotKept, Page, Sample, Series, Status, counted, matching, node_of, numbers_in, snippets
 from .timeline import UNKNOWN
 from .trees import Frame, differing, thawed
 
@@ -298,6 +298,9 @@ class LiveSource:
             if node is not None and (node.text if node.size is None else node.size <= _SHORT):
                 samples = [(end, await self._read(path))]
         return numbers_in(samples)
+
+    async def losses(self, path: Path, start: float, end: float) -> list[Loss]:
+        return self.history.losses.of(str(path[0]), start, end)
 
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
         """Return paths with `text` in them: keys first, then what is below those that the buffer knows."""

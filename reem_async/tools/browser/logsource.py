@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path as FilePath
 from typing import Any, TypeVar
@@ -12,11 +13,12 @@ import anyio.to_thread
 import numpy as np
 
 from ...errors import MissingKey, ReadOnly
-from ...plan.paths import Path, show
+from ...plan.paths import Path, parse, related, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import MISSING, get, mapped
 from ..recording.log import ArrayHandle, Log, open_log
 from .source import (
+    Loss,
     Node,
     Page,
     Sample,
@@ -64,6 +66,7 @@ class LogSource(Source):
         # When there was news of a path, sorted; read when it is asked for, since all of a long recording takes seconds.
         self._times = lru_cache(_CACHED)(self.log.news_times)
         self._state = lru_cache(_CACHED)(self._read_state)
+        self._gaps = lru_cache(1)(self.log.gaps)
         self._turns = anyio.CapacityLimiter(1)
 
     async def start(self) -> None:
@@ -153,7 +156,18 @@ class LogSource(Source):
         # Large arrays are not read for this. What was deleted at the end may have been numbers before.
         found = [get(self._state(at), path) for at in {end, *news}]
         if any(isinstance(it, bool | int | float | list) or is_small_vector(it) for it in found):
+            if start > self.log.start:  # what was there already
+                with suppress(MissingKey):
+                    yield start, self.log.value_at(path, start)
             yield from self.log[path].values(start, end)
+
+    async def losses(self, path: Path, start: float, end: float) -> list[Loss]:
+        return await self._do(lambda: list(self._losses(path, start, end)))
+
+    def _losses(self, path: Path, start: float, end: float) -> Iterator[Loss]:
+        for when, where, count in self._gaps():
+            if start <= when <= end and related(parse(where), path):
+                yield Loss(self.log.last_news(path, when - _ROUNDING) or when, when, count)
 
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
         state = await self._do(lambda: self._state(self._when(at)))

@@ -181,6 +181,12 @@ class Sample(NamedTuple):
     age: float | None = None  # seconds from when it was read to the instant asked for; None if that is not known
 
 
+class Loss(NamedTuple):
+    start: float  # when the last update before it came, in seconds since 1970
+    end: float  # when it was noticed, or over
+    missed: int | None  # how many updates were lost; None if that is not known
+
+
 class Series(NamedTuple):
     names: list[str]  # what each line is: one empty text, or the indexes of a list
     times: list[float]  # seconds since 1970
@@ -243,6 +249,9 @@ class Source(Protocol):
 
     async def series(self, path: Path, start: float, end: float) -> Series: ...
 
+    # Where updates of a path were lost, or may have been.
+    async def losses(self, path: Path, start: float, end: float) -> list[Loss]: ...
+
 
 # Seconds before an instant in which updates are counted.
 _RATE_SECONDS = 5.0
@@ -279,6 +288,21 @@ def numbers_in(samples: Iterable[tuple[float, Any]]) -> Series:
     if all(number is None for line in lines for number in line):
         return Series([], [], [])
     return Series([f"[{index}]" for index in range(width)] if width else [""], times, lines)
+
+
+# Silence is worth a mark from so many times the usual pause on, and so many seconds, where so many updates came.
+_LONG_PAUSE, _SHORTEST_SILENCE, _FEWEST = 10, 0.5, 8
+
+
+def silences(times: Sequence[float], end: float) -> list[tuple[float, float]]:
+    """Return the spans in which nothing came of what usually comes more often, until `end`."""
+    if len(times) <= _FEWEST:
+        return []
+    pauses = np.diff([*times, max(end, times[-1])])
+    # The first is the beginning of what is known, and no update.
+    long = max(_LONG_PAUSE * float(np.median(pauses[1:-1])), _SHORTEST_SILENCE)
+    places = np.flatnonzero(pauses > long).tolist()
+    return [(times[place], times[place] + float(pauses[place])) for place in places]
 
 
 def thinned(columns: np.ndarray[Any, Any], most: int) -> list[int]:

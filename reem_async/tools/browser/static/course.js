@@ -1,6 +1,61 @@
-// Numbers over time: one, or the few of a small list or vector.
+// Numbers over time: one, the few of a small list or vector, or those of several keys; and the time that all plots show.
 import { Plot } from "./plot.js";
-import { el, getJson } from "./util.js";
+import { el, getJson, toast } from "./util.js";
+
+const MOST_KEYS = 8; // in one plot
+const SETTLED = 150; // ms without another step of zooming until the part that is shown is read
+
+// What all plots over time have in common: the part of it that they show, and the instant under the pointer.
+export class TimeAxis {
+  constructor(app) {
+    Object.assign(this, { app, window: null, hover: null, plots: new Set() });
+  }
+
+  get full() { return [this.app.span.start, Math.max(this.app.span.end, this.app.span.start + 1e-3)]; }
+
+  // The part that is shown, null for all. One that ended at the newest instant goes on with it.
+  get shown() {
+    if (!this.window || !this.follows) return this.window;
+    const [start, end] = this.window, now = this.app.span.end;
+    return [now - (end - start), now];
+  }
+
+  // What is read to show it: more on both sides, in steps, so that a little panning reads nothing.
+  get read() {
+    if (!this.shown) return [null, null];
+    const [start, end] = this.shown, step = 2 ** Math.ceil(Math.log2(end - start)) / 2;
+    return [Math.max((Math.floor(start / step) - 1) * step, this.full[0]), (Math.ceil(end / step) + 1) * step];
+  }
+
+  zoom(window) {
+    this.window = window;
+    this.follows = Boolean(window) && this.app.config.live && window[1] > this.full[1] - 0.02 * (window[1] - window[0]);
+    this.each("draw");
+    clearTimeout(this.settling);
+    this.settling = setTimeout(() => this.app.refresh(), SETTLED);
+  }
+
+  // The mark of the slider in all plots, before anything is read for that instant.
+  seek(at) {
+    for (const plot of this.plots) plot.cursor = at;
+    this.each("paint");
+  }
+
+  point(at) {
+    this.hover = at;
+    this.each("paint");
+  }
+
+  // All plots are drawn in the next frame, however often the pointer moves before it: wholly, or what follows the pointer.
+  each(how) {
+    if (this.due !== "draw") this.due = how;
+    this.frame ??= requestAnimationFrame(() => {
+      const { due } = this;
+      this.frame = this.due = null;
+      for (const plot of this.plots) if (plot.canvas.isConnected) plot[due](); else this.plots.delete(plot);
+    });
+  }
+}
 
 export class Course {
   // pause: ms between two looks at a live server.
@@ -8,18 +63,60 @@ export class Course {
     Object.assign(this, { app, address, pause });
     this.card = el("div", { class: small ? "small-plot" : "card", hidden: true });
     parent.append(this.card);
-    this.plot = new Plot(this.card, { time: true, onPick: (at) => { app.time.pause(); app.seek(at); }, label: `Course of ${address} over time; a click shows that instant` });
+    const { log } = app.layout.plot(address);
+    this.plot = new Plot(this.card, {
+      axis: app.axis, small, log, label: `Course of ${address} over time; a click shows that instant`,
+      onPick: (at) => { app.time.pause(); app.seek(at); }, onLog: (on) => app.layout.setPlot(address, { log: on }), onRemove: (key) => this.keep(this.others.filter((each) => each !== key)),
+    });
+    this.plot.tools.append(el("button", { type: "button", title: "Draw another key in this plot (or drag its row onto it)", "aria-label": "Draw another key in this plot", onclick: () => this.ask() }, "+ key"));
+    this.card.addEventListener("dragover", (event) => { if (event.dataTransfer.types.includes(ROW)) event.preventDefault(); });
+    this.card.addEventListener("drop", (event) => this.add(event.dataTransfer.getData(ROW)));
+  }
+
+  get others() { return this.app.layout.plot(this.address).keys ?? []; }
+
+  ask() {
+    const names = el("datalist", { id: `keys-of-${this.address}` });
+    const box = el("input", { type: "text", placeholder: "another key", title: "Enter adds it, Esc closes", "aria-label": "Key to draw in this plot", spellcheck: false, autocomplete: "off" });
+    box.setAttribute("list", names.id);
+    box.addEventListener("input", async () => {
+      const { found } = await getJson("search", { q: box.value, at: this.app.at });
+      names.replaceChildren(...found.map(({ address }) => el("option", { value: address })));
+    });
+    const form = el("form", { class: "add-key", onsubmit: (event) => { event.preventDefault(); box.blur(); this.add(box.value.trim()); } }, box, names);
+    box.addEventListener("keydown", (event) => { if (event.key === "Escape") box.blur(); });
+    box.addEventListener("blur", () => form.remove());
+    this.plot.tools.before(form);
+    box.focus();
+  }
+
+  add(key) {
+    if (!key || key === this.address || this.others.includes(key)) return undefined;
+    if (this.others.length + 1 >= MOST_KEYS) return toast(`${MOST_KEYS} keys are in this plot: take one out first`);
+    return this.keep([...this.others, key]);
+  }
+
+  keep(keys) {
+    this.app.layout.setPlot(this.address, { keys });
+    this.app.refresh();
   }
 
   async update(signal) {
-    const { app } = this, now = performance.now(), live = app.config.live && app.at === null;
-    const key = live ? null : `${app.config.live ? Math.floor(app.span.end / 2) : ""}`;
-    if (live ? now > (this.asked ?? -Infinity) + this.pause || this.key !== null : key !== this.key) {
+    const { app, others } = this, now = performance.now(), live = app.config.live && app.at === null, [start, end] = app.axis.read;
+    const fixed = live ? "" : app.config.live ? Math.floor(app.span.end / 2) : "log", key = JSON.stringify([others, start, app.axis.follows && end, fixed]);
+    if (key !== this.key || (live && now > this.asked + this.pause)) {
       this.asked = now;
-      this.data = await getJson("series", { path: this.address }, signal);
+      const ask = (path) => getJson("series", { path, start, end: app.axis.follows ? null : end }, signal);
+      const [first, ...more] = await Promise.all([ask(this.address), ...others.map((path) => ask(path).catch((error) => { if (!error.status) throw error; return { names: [], times: [], lines: [] }; }))]);
+      const missing = others.filter((_, index) => !more[index].lines.length);
+      if (missing.length && this.told !== `${missing}`) toast(`No numbers at ${missing.join(", ")}`);
+      this.told = `${missing}`;
+      this.data = others.length ? [first, ...more].map((each, index) => ({ ...each, key: index ? others[index - 1] : this.address })) : first;
       this.key = key;
     }
-    this.card.hidden = !this.data.lines.length;
+    this.card.hidden = ![this.data].flat().some((each) => each.lines.length);
     if (!this.card.hidden) this.plot.set(this.data, app.at);
   }
 }
+
+export const ROW = "application/x-reem-key"; // the type of a row of the tree that is dragged

@@ -1,5 +1,6 @@
 // The page: which path and which instant are shown, what keeps them up to date, and the keyboard.
-import { Pins } from "./panes.js";
+import { TimeAxis } from "./course.js";
+import { Layout } from "./layout.js";
 import { STEP, TimeBar } from "./slider.js";
 import { makeSplitter } from "./splitter.js";
 import { Tree } from "./tree.js";
@@ -15,7 +16,7 @@ const app = {
   at: null, // null: now, or the end of a recording
   previous: null, // the instant shown before
   path: "",
-  pins: new Pins(config.title),
+  layout: new Layout(config.title),
   span: { start: config.start, end: config.end },
   heard: performance.now(),
   done: 0,
@@ -42,6 +43,7 @@ const app = {
     this.previous = this.at ?? this.span.end; // from when on changes are marked
     this.at = at;
     time.show();
+    this.axis.seek(at);
     this.refresh();
     clearTimeout(this.remembering);
     this.remembering = setTimeout(() => history.replaceState(null, "", this.url()), 300);
@@ -239,6 +241,7 @@ function onKey(event) {
   event.preventDefault();
 }
 
+app.axis = new TimeAxis(app);
 const time = new TimeBar(app);
 const tree = new Tree(document.getElementById("tree"), app, "", `reem:open:${config.title}`);
 const view = new View(document.getElementById("view"), app);

@@ -1,28 +1,12 @@
 // Panes: pictures and plots side by side, of what is in a dict, or of what is busy or pinned.
 import { Course } from "./course.js";
 import { Plot } from "./plot.js";
-import { addressUrl, el, getJson, getPicture, icon, setNumbers, setText, store, stored, swap, toast } from "./util.js";
+import { addressUrl, el, getJson, getPicture, icon, setNumbers, setText, swap } from "./util.js";
 
 export const MOST = 12; // panes at a time
 const PAUSE = 1000; // ms between two looks at a course: a dozen of them cost the program as much as one in full
 const PIN = "M5.5 1.5h5l-.8 4.5 2.3 2.5H8.6V14L8 15l-.6-1V8.5H4l2.3-2.5z";
 const SHORT = 16; // numbers of a vector that are drawn over time
-
-export class Pins {
-  constructor(title) { this.name = `reem:pins:${title}`; }
-
-  get all() { return stored(this.name, []); }
-
-  has(address) { return this.all.includes(address); }
-
-  toggle(address) {
-    const { all } = this;
-    if (!all.includes(address) && all.length >= MOST) return toast(`${MOST} are pinned: unpin one first`);
-    return store(this.name, all.includes(address) ? all.filter((each) => each !== address) : [...all, address]);
-  }
-
-  order(addresses) { store(this.name, [...addresses.filter((each) => this.has(each)), ...this.all.filter((each) => !addresses.includes(each))]); }
-}
 
 class Pane {
   constructor(grid, node) {
@@ -30,7 +14,7 @@ class Pane {
     Object.assign(this, { grid, address });
     const { app } = grid;
     this.value = el("span", { class: "pane-value" });
-    this.pin = el("button", { class: "quiet pin", type: "button", onclick: () => { app.pins.toggle(address); this.showPin(); grid.onPin?.(); } }, icon(PIN));
+    this.pin = el("button", { class: "quiet pin", type: "button", onclick: () => { app.layout.toggle(address); this.showPin(); grid.onPin?.(); } }, icon(PIN));
     const title = el("a", { href: addressUrl(address), "data-go": address, title: address, draggable: false }, el("bdi", {}, grid.label(address)));
     this.head = el("div", { class: "pane-head", draggable: true, title: "Drag to move" }, title, this.value, this.pin);
     this.body = el("div", { class: "pane-body" });
@@ -40,7 +24,7 @@ class Pane {
   }
 
   showPin() {
-    const pinned = this.grid.app.pins.has(this.address), says = pinned ? "Take off the first page" : "Show on the first page";
+    const pinned = this.grid.app.layout.has(this.address), says = pinned ? "Take off the first page" : "Show on the first page";
     this.pin.setAttribute("aria-pressed", String(pinned));
     this.pin.setAttribute("aria-label", `${says}: ${this.address}`);
     this.pin.title = says;
@@ -166,6 +150,6 @@ export class Panes {
   onEnd() {
     this.dragged?.classList.remove("dragged");
     this.dragged = null;
-    this.app.pins.order([...this.element.children].map((it) => it.address));
+    this.app.layout.order([...this.element.children].map((it) => it.address));
   }
 }

@@ -26,6 +26,10 @@ export class TimeBar {
     find("back").addEventListener("click", () => this.step(-STEP));
     find("forth").addEventListener("click", () => this.step(STEP));
     new ResizeObserver(() => this.drawActivity()).observe(this.canvas);
+    const track = this.canvas.parentElement;
+    track.addEventListener("pointermove", (event) => app.axis.point(this.instantAt(event.clientX)));
+    track.addEventListener("pointerleave", () => app.axis.point(null));
+    app.axis.plots.add(this);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawActivity());
   }
 
@@ -92,6 +96,17 @@ export class TimeBar {
     app.seek(at < app.span.end ? at : null);
   }
 
+  // The instant below a place on the strip, at which all plots show their values.
+  instantAt(clientX) {
+    const box = this.canvas.getBoundingClientRect(), { start, end } = this.app.span;
+    return start + Math.min(Math.max((clientX - box.left) / Math.max(box.width, 1), 0), 1) * (end - start);
+  }
+
+  // As a plot has it: drawn when the pointer, or the part that plots show, moves.
+  paint() { this.drawActivity(); }
+
+  draw() { this.drawActivity(); }
+
   async loadActivity() {
     try {
       this.counts = await getJson("activity", { bins: 150, path: this.app.path });
@@ -122,6 +137,14 @@ export class TimeBar {
       context.globalAlpha = kept === 2 ? 1 : 0.45;
       if (kept) bar(index, 0, 3);
     });
+    const { shown, hover } = this.app.axis, at = (instant) => ((instant - start) / span) * box.width;
+    context.globalAlpha = 1;
+    if (shown) { // the part that plots show
+      context.fillStyle = style.getPropertyValue("--accent").trim();
+      context.fillRect(at(shown[0]), 0, Math.max(at(shown[1]) - at(shown[0]), 2), 2);
+    }
+    context.fillStyle = style.getPropertyValue("--soft").trim();
+    if (hover !== null) context.fillRect(at(hover), 0, 1, box.height);
     const [whole, small] = [2, 1].map((kind) => counts.pictures.filter((kept) => kept === kind).length);
     canvas.title = foot ? `Changes, and below them where arrays are kept: whole in ${whole} of ${counts.pictures.length} parts, small pictures in ${small}` : "Changes";
   }

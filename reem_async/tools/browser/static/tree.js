@@ -1,5 +1,6 @@
 // The tree of keys: rows made once and changed in place, branches loaded when they are opened, long ones in pages.
 import { Spark } from "./spark.js";
+import { ROW } from "./course.js";
 import { addressUrl, ageText, bytesText, el, getJson, icon, nameOf, setNumbers, setText, steps, store, stored, toast } from "./util.js";
 
 const PAGE = 100;
@@ -129,7 +130,7 @@ export class Tree {
     const key = el("span", { class: "key" }, twist, leaf, name);
     const value = el("bdi", { class: "value" }), size = el("span"), age = el("span", { class: "age" });
     const spark = new Spark();
-    const row = el("div", { class: "row", role: "treeitem", tabIndex: -1, title: "" }, key, value, el("span", { class: "size" }, size, spark.canvas), age);
+    const row = el("div", { class: "row", role: "treeitem", tabIndex: -1, title: "", draggable: true, ondragstart: (event) => event.dataTransfer.setData(ROW, node.address) }, key, value, el("span", { class: "size" }, size, spark.canvas), age);
     row.parts = { key, name, twist, leaf, value, size, spark, age };
     row.address = node.address;
     row.dataset.address = node.address;

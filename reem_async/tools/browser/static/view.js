@@ -89,14 +89,14 @@ export class View {
   }
 
   pinButton() {
-    const { pins } = this.app;
+    const { layout } = this.app;
     const show = () => {
-      const pinned = pins.has(this.address);
+      const pinned = layout.has(this.address);
       setText(button, pinned ? "Unpin" : "Pin");
       button.title = pinned ? "Take it off the first page" : "Show it on the first page";
       button.setAttribute("aria-pressed", String(pinned));
     };
-    const button = el("button", { type: "button", class: "quiet pinned", onclick: () => { pins.toggle(this.address); show(); } });
+    const button = el("button", { type: "button", class: "quiet pinned", onclick: () => { layout.toggle(this.address); show(); } });
     show();
     return button;
   }
@@ -245,7 +245,7 @@ class Home {
   }
 
   async update(signal) {
-    const pins = this.app.pins.all, nodes = pins.length ? await this.pinned(pins, signal) : await this.busiest(signal);
+    const pins = this.app.layout.pins, nodes = pins.length ? await this.pinned(pins, signal) : await this.busiest(signal);
     if (signal?.aborted) return;
     setText(this.title, nodes.length ? (pins.length ? "Pinned" : "Busiest keys") : "");
     this.hint.hidden = nodes.length > 0;
