@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import builtins
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, Self, TypeVar, overload
 
-from reem_async.coordination.parameters import prepared
-from reem_async.coordination.services import QUEUE
+from reem_async.coordination.parameter_objects import prepared
+from reem_async.coordination.services import QUEUE, Arguments, Result
 from reem_async.errors import BadType, RedisError, ReemError
 from reem_async.plan.arguments import Handle
 from reem_async.plan.paths import Path, show
@@ -19,7 +18,7 @@ from reem_async.store import store as core_store
 
 from ._twin import FOLLOWER, calls, documented_by, makes, runs, shares, waits
 from .connection import RedisInterface
-from .coordination import Service, declared
+from .coordination import Parameter, Service, declared
 from .following import Watch
 from .mirror import Mirror
 from .view import View
@@ -146,15 +145,28 @@ class Accessor(Handle):
     mirror = makes(core.Accessor.mirror, Mirror, FOLLOWER)
     call = waits(core.Accessor.call, FOLLOWER)
     own = makes(core.Accessor.own, lambda interface, inner: OwnedAccessor(interface, inner))
-    # The arguments are checked here, and declared on the background loop.
-    parameter = makes(
-        core.Accessor.parameter, declared, lambda self: SimpleNamespace(parameter=partial(prepared, self.full_path))
-    )
     _ipython_key_completions_ = known_keys
 
     def of(self, kind: builtins.type[T]) -> View[T]:
         """Return this place as objects of a class."""
         return View(self, self._core.of(kind))
+
+    def parameter(
+        self,
+        name: str,
+        default: T,
+        *,
+        low: Any = None,
+        high: Any = None,
+        unit: str = "",
+        help: str = "",  # noqa: A002
+        choices: Iterable[Any] | None = None,
+        on_change: Callable[[T], Any] | None = None,
+    ) -> Parameter[T]:
+        """Declare a parameter in the dict here, and return it: `float(kp)` and `kp.value` are always current."""
+        # The arguments are checked here, and declared on the background loop.
+        specification = {"low": low, "high": high, "unit": unit, "help": help, "choices": choices}
+        return declared(self._interface, prepared(self.full_path, name, default, on_change=on_change, **specification))
 
     # Not by way of the methods: an error that says it all shows one frame less.
 
@@ -191,11 +203,13 @@ class Accessor(Handle):
         return core.rebuilt(kind, writer, session, self._core.full_path)  # type: ignore[no-any-return]
 
     @overload
-    def serve(self, function: Callable[..., Any], *, concurrency: int = 1, queue: int = QUEUE) -> Service: ...
+    def serve(
+        self, function: Callable[Arguments, Result], *, concurrency: int = 1, queue: int = QUEUE
+    ) -> Service[Arguments, Result]: ...
     @overload
     def serve(
         self, function: None = None, *, concurrency: int = 1, queue: int = QUEUE
-    ) -> Callable[[Callable[..., Any]], Service]: ...
+    ) -> Callable[[Callable[Arguments, Result]], Service[Arguments, Result]]: ...
 
     def serve(self, function: Callable[..., Any] | None = None, *, concurrency: int = 1, queue: int = QUEUE) -> Any:
         """Answer calls of the service at this place with a function: `@kvs["policy"].serve`, or with a `with` block."""

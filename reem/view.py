@@ -63,6 +63,13 @@ class View(Generic[T]):
         """Return a local copy that follows."""
         return ViewMirror(self._accessor.mirror(max_age=max_age, stale=stale, ttl=ttl), self._core)
 
+    def call(self, /, *, timeout: float | None = None, **arguments: Any) -> T:
+        """Ask the service at this place."""
+        return self._core._made(self._accessor.call(timeout=timeout, **arguments))
+
+    def __dir__(self) -> list[str]:
+        return dir(self._core)
+
     def __repr__(self) -> str:
         return repr(self._core).replace("reem_async", "reem")
 
@@ -109,6 +116,10 @@ class ViewMirror(Following, Generic[T]):
     def value(self, *default: T) -> T:
         """Return the object as of now."""
         return core.mirrored(self._mirror, self._view, default)
+
+    def wait_until(self, predicate: Callable[[T], Any], timeout: float | None = None) -> T:
+        """Wait until the object is as wanted."""
+        return self._view._made(self._mirror.wait_until(core.wanted(self._view, predicate), timeout))
 
 
 class ViewEdit(Generic[T]):

@@ -9,9 +9,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, Generic, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 
@@ -46,6 +46,8 @@ from .specification import Specification, as_json, equal, from_stored, specified
 
 logger = logging.getLogger("reem.parameters")
 
+T = TypeVar("T")
+
 SPECIFICATIONS = "_parameters"
 """The top-level key under which programs store what they declare, by the path of the parameter as text."""
 
@@ -62,6 +64,7 @@ class Declaration(NamedTuple):
     on_change: Callable[[Any], Any] | None
 
     def given(self, value: Any) -> Any:
+        """Return a value as the program gets it."""
         if not isinstance(value, tuple):
             return value
         if not self.is_array:
@@ -69,6 +72,9 @@ class Declaration(NamedTuple):
         array = np.array(value)
         array.flags.writeable = False
         return array
+
+    async def begin(self, group: ParameterGroup) -> LiveParameter:
+        return await group.declare(self)
 
 
 def prepared(
@@ -81,10 +87,14 @@ def prepared(
         raise BadKey(f"{where}: a parameter cannot be in a list or in {SPECIFICATIONS}; use a dict of another key")
     if '"' in where and "'" in where:
         raise BadKey(f"{where}: a quote in the path of a parameter does not go with a dot or quote; use other names")
-    if on_change is not None and not callable(on_change):
-        raise BadType(f"{where}: on_change={shorten(on_change)} is not a function; use one that takes the value")
+    check_on_change(where, on_change)
     found = specified(where, default, **specification)
     return Declaration(path, found, isinstance(default, np.ndarray), on_change)
+
+
+def check_on_change(where: str, function: Any) -> None:
+    if function is not None and not callable(function):
+        raise BadType(f"{where}: on_change={shorten(function)} is not a function; use one that takes the value")
 
 
 class ChangeQueue(BoundedQueue):
@@ -103,47 +113,35 @@ class ChangeQueue(BoundedQueue):
         """Report no losses: only the newest value matters."""
 
 
-class LiveParameter:
-    def __init__(self, group: ParameterGroup, path: Path, specification: Specification) -> None:
+class Live:
+    """What a program follows of one declaration."""
+
+    def __init__(self, group: ParameterGroup, path: Path, default: Any) -> None:
         self.group = group
         self.path = path
         self.name = show(path)
-        self.specification = specification
-        self.value = specification.default  # the last good one
+        self.default = default
+        self.value = default  # the last good one
         self.invalid = ""  # why the stored value is not used; empty if it is
-        self.gone = True  # nothing is stored
         self.begun = False  # changes are reported
         self.changes: list[tuple[ChangeQueue, Callable[[Any], Any]]] = []  # with what makes a value the program's
-        self._raw: Any = MISSING
         self._waiting: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
         self._reported: set[str] = set()
 
-    def take(self, raw: Any) -> None:
-        if raw is self._raw:  # the copy shares what has not changed
-            return
-        self._raw = raw
-        self.gone, self.invalid = raw is MISSING, ""
-        if self.gone:
-            self._set(self.specification.default)
-            if self.begun:
-                self.group.restore(self)
-        else:
-            try:
-                self._set(self.specification.checked(self.name, raw))
-            except BadInput as error:
-                self.invalid = str(error)
-                self.report(f"the stored value is ignored, and {shorten(as_json(self.value))} stays: {error}")
-        for condition, future in self._waiting:
-            if condition() and not future.done():
-                future.set_result(None)
+    async def write(self, value: Any) -> None:
+        """Check and publish a value; when this returns, it is the present one unless another was written since."""
+        raise NotImplementedError
 
     def _set(self, value: Any) -> None:
-        if equal(value, self.value):
-            return
         self.value = value
         if self.begun:
             for queue, given in self.changes:
                 queue.put_value(self.name, given(value))
+
+    def _wake(self) -> None:
+        for condition, future in self._waiting:
+            if condition() and not future.done():
+                future.set_result(None)
 
     def report(self, text: str) -> None:
         if text not in self._reported and len(self._reported) < _MOST_REPORTED:
@@ -162,12 +160,47 @@ class LiveParameter:
         finally:
             self._waiting.remove(waiting)
 
-    async def write(self, value: Any) -> None:
-        """Check and publish a value; when this returns, it is the present one unless another was written since."""
-        value = self.specification.checked(self.name, value)
-        with self.awaited(lambda: not self.gone and not self.invalid and equal(value, self.value)) as seen:
-            await publish(self.group.session, self.path, value)
+    async def _written(self, condition: Callable[[], bool], publishing: Awaitable[None]) -> None:
+        """Publish, and wait until the copy has it."""
+        with self.awaited(condition) as seen:
+            await publishing
             await asyncio.wait([seen], timeout=_ECHO)
+
+
+class LiveParameter(Live):
+    def __init__(self, group: ParameterGroup, path: Path, specification: Specification) -> None:
+        super().__init__(group, path, specification.default)
+        self.specification = specification
+        self.gone = True  # nothing is stored
+        self._raw: Any = MISSING
+
+    def take(self, raw: Any) -> None:
+        if raw is self._raw:  # the copy shares what has not changed
+            return
+        self._raw = raw
+        self.gone, self.invalid = raw is MISSING, ""
+        if self.gone:
+            self._set(self.specification.default)
+            if self.begun:
+                self.group.restore(self)
+        else:
+            try:
+                self._set(self.specification.checked(self.name, raw))
+            except BadInput as error:
+                self.invalid = str(error)
+                self.report(f"the stored value is ignored, and {shorten(as_json(self.value))} stays: {error}")
+        self._wake()
+
+    def _set(self, value: Any) -> None:
+        if not equal(value, self.value):
+            super()._set(value)
+
+    async def write(self, value: Any) -> None:
+        value = self.specification.checked(self.name, value)
+        await self._written(
+            lambda: not self.gone and not self.invalid and equal(value, self.value),
+            publish(self.group.session, self.path, value),
+        )
 
 
 class ParameterGroup:
@@ -177,6 +210,7 @@ class ParameterGroup:
         self.session = session
         self._keys = keys
         self._parameters: dict[Path, LiveParameter] = {}
+        self.objects: dict[tuple[Path, type], Any] = {}  # by path and class
         self.queues: list[BoundedQueue] = []  # closed when following ends
         make = partial(Follower, keys, (), session.ships, session.cache, stored=True, largest=_LARGEST)
         self._link = Link(session, make, self.queues)
@@ -228,6 +262,8 @@ class ParameterGroup:
             return
         for live in tuple(self._parameters.values()):
             live.take(get(tree, live.path[1:]))
+        for each in tuple(self.objects.values()):
+            each.take()
         if self._may_be_lost:
             self._restore_soon()
 
@@ -311,15 +347,16 @@ class ParameterGroup:
             await asyncio.sleep(_PAUSE)
 
 
-async def declare(session: Session, declaration: Declaration) -> LiveParameter:
+async def declare(session: Session, declaration: Any) -> Live:
     """Return the parameter of a declaration; see `Accessor.parameter`."""
     kept, keys = manager_of(session).kept, session.keys(declaration.path[0])
     place = ParameterGroup, keys.name
     group: ParameterGroup = kept.get(place) or kept.setdefault(place, ParameterGroup(session, keys))
-    return await group.declare(declaration)
+    live: Live = await declaration.begin(group)
+    return live
 
 
-def changes_of(live: LiveParameter, declaration: Declaration) -> tuple[Caller, ChangeQueue]:
+def changes_of(live: Live, declaration: Any) -> tuple[Caller, ChangeQueue]:
     """Return what calls the `on_change` of a declaration, and the queue of the values that it is called with."""
     on_change, queue = declaration.on_change, ChangeQueue()
     assert on_change is not None
@@ -328,7 +365,7 @@ def changes_of(live: LiveParameter, declaration: Declaration) -> tuple[Caller, C
     return Caller(live.name, lambda update: on_change(update.data)), queue
 
 
-class Parameter(Handle):
+class Parameter(Handle, Generic[T]):
     """A value that is declared with type and bounds, kept current, and read without a round trip.
 
     `await kvs["control"].parameter("kp", 2.0, low=0.0, high=10.0)` returns one. `float(kp)`, `int(kp)`, `bool(kp)`,
@@ -338,22 +375,24 @@ class Parameter(Handle):
     __slots__ = ("_declaration", "_live")
     _how_to_read = ".value, float() or int()"
 
-    def __init__(self, live: LiveParameter, declaration: Declaration) -> None:
+    def __init__(self, live: Live, declaration: Any) -> None:
         self._live = live
         self._declaration = declaration
 
     @property
-    def value(self) -> Any:
+    def value(self) -> T:
         """The value as of now, without a round trip: the last good one that was stored, or the default.
 
-        Any thread may ask. A vector is a new list, or a read-only array if the default is an array. Raises Stale once
-        the interface is closed, and in a forked child or another event loop until it is declared there.
+        Any thread may ask. A vector is a new list, or a read-only array if the default is an array. An object is a new
+        one: changing it changes nothing else. Raises Stale once the interface is closed, and in a forked child or
+        another event loop until it is declared there.
         """
         self._check()
-        return self._declaration.given(self._live.value)
+        value: T = self._declaration.given(self._live.value)
+        return value
 
     @value.setter
-    def value(self, value: Any) -> None:
+    def value(self, value: T) -> None:
         self._assign(value)
 
     def _check(self) -> None:
@@ -362,8 +401,8 @@ class Parameter(Handle):
     def _assign(self, value: Any) -> None:
         raise BadType(f"assignment cannot wait for the server; use: await parameter.write({shorten(value)})")
 
-    async def write(self, value: Any) -> None:
-        """Publish a value. One round trip; afterwards it is `value`, unless another was written since.
+    async def write(self, value: T) -> None:
+        """Publish a value. One round trip, three for an object; afterwards it is `value`, unless one was written since.
 
         Raises:
             BadType, BadValue: It is not of the type, out of range or not among the choices; nothing was sent.
@@ -382,19 +421,22 @@ class Parameter(Handle):
         return self._live.name
 
     @property
-    def default(self) -> Any:
+    def default(self) -> T:
         """The value where none is stored."""
-        return self._declaration.given(self._live.specification.default)
+        default: T = self._declaration.given(self._live.default)
+        return default
 
     @property
     def _place(self) -> tuple[object, Path]:
         return self._live.group, self._live.path
 
     def __float__(self) -> float:
-        return float(self.value)
+        value: Any = self.value
+        return float(value)
 
     def __int__(self) -> int:
-        return int(self.value)
+        value: Any = self.value
+        return int(value)
 
     def __bool__(self) -> bool:
         return bool(self.value)
@@ -412,7 +454,7 @@ class Parameter(Handle):
         raise BadType(f"{self.name}: a parameter cannot be pickled; declare it in each program")
 
 
-async def declared(session: Session, declaration: Declaration) -> Parameter:
+async def declared(session: Session, declaration: Any) -> Parameter[Any]:
     live = await declare(session, declaration)
     if declaration.on_change is not None:
         caller, queue = changes_of(live, declaration)

@@ -22,7 +22,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Generic, ParamSpec, Self, TypeVar
 
 from ..concurrency.tasks import is_being_cancelled, take_short_turns
 from ..errors import (
@@ -50,6 +50,9 @@ from .calls import Post, encoded, naming_rights, new_id, opened, publish
 from .messages import Encoded, Message, Names, Put
 
 logger = logging.getLogger("reem.services")
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 QUEUE = 100  # requests that wait at most, unless another number is given
 _LEFT = 1000  # calls that are remembered as left before their request came: it may be large and on its way
@@ -421,7 +424,7 @@ def is_async(function: Any) -> bool:
     return inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(getattr(function, "__call__", None))  # noqa: B004
 
 
-class Service:
+class Service(Generic[Arguments, Result]):
     """A function that answers the calls of a service; `serve` of an accessor returns it.
 
     It serves from `listen()` on, or from the next turn of the event loop, until `close()` or the end of the interface;
@@ -444,7 +447,7 @@ class Service:
         session: Session,
         keys: Keys,
         path: Path,
-        function: Callable[..., Any],
+        function: Callable[Arguments, Result],
         concurrency: int = 1,
         queue: int = QUEUE,
     ) -> None:
@@ -462,7 +465,7 @@ class Service:
         self._beginning = asyncio.Lock()
         functools.update_wrapper(self, function, updated=())
 
-    def __call__(self, *args: Any, **arguments: Any) -> Any:
+    def __call__(self, *args: Arguments.args, **arguments: Arguments.kwargs) -> Result:
         """Call the function here, in this program."""
         return self.function(*args, **arguments)
 

@@ -152,7 +152,7 @@ def _type_of(where: str, default: Any) -> str:
         return kind
     raise BadType(
         f"{where}: the default {shorten(default)} is not a bool, int, float, str or one-dimensional vector of numbers; "
-        "use one of these"
+        "use one of these, or an object of a class whose fields are"
     )
 
 

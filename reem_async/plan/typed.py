@@ -96,7 +96,7 @@ def element(annotation: Any, key: str | int, path: Path) -> Any:
     Raises:
         BadType: There is no such element.
     """
-    annotation, _ = _bare(annotation)
+    annotation, _ = bare(annotation)
     fields, origin, arguments = fields_of(annotation), get_origin(annotation), get_args(annotation)
     if fields is not None and key in fields:
         return fields[str(key)].annotation
@@ -151,7 +151,7 @@ def _hints_of(function: Any) -> dict[str, Any]:
 
 
 def _is_typed(annotation: Any) -> bool:
-    annotation, notes = _bare(annotation)
+    annotation, notes = bare(annotation)
     is_scalar = (
         annotation in _SCALARS
         or _is(annotation, enum.Enum)
@@ -199,7 +199,7 @@ _SETS: dict[Any, Any] = {
 
 
 def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
-    annotation, notes = _bare(annotation)
+    annotation, notes = bare(annotation)
     for note in notes:
         if type(note).__module__ == "msgspec":  # which has been imported then
             _constrained(annotation, note, value, path)
@@ -297,7 +297,7 @@ def _chosen(choices: tuple[Any, ...], value: Any, path: Path, way: _Direction, n
 
 def _distance(choice: Any, value: Any) -> float:
     """Return how far a value is from a choice: below any other if it is of its class."""
-    kind, _ = _bare(choice)
+    kind, _ = bare(choice)
     if type(value) is class_of(kind):
         return -math.inf
     fields = fields_of(kind)
@@ -359,7 +359,7 @@ def _dict(annotation: Any, fields: dict[str, Field], value: Any, path: Path) -> 
     return {**unknown, **found}
 
 
-def _bare(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
+def bare(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
     """Return an annotation without what only names it, and what `Annotated` adds to it."""
     notes: tuple[Any, ...] = ()
     while True:

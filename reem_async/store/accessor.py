@@ -14,8 +14,9 @@ from ..concurrency.queues import Newest, Policy, chosen
 from ..connection import RedisInterface
 from ..coordination.calls import call
 from ..coordination.lease import Lease, OwnedPublisher
-from ..coordination.parameters import Parameter, declared, prepared
-from ..coordination.services import QUEUE, Service
+from ..coordination.parameter_objects import prepared
+from ..coordination.parameters import Parameter, declared
+from ..coordination.services import QUEUE, Arguments, Result, Service
 from ..errors import BadKey, BadType, MissingDocument, MissingKey, Misuse, WrongType
 from ..plan.arguments import Handle, cannot_wait
 from ..plan.documents import number_text
@@ -450,15 +451,15 @@ class Accessor(Handle):
     async def parameter(
         self,
         name: str,
-        default: Any,
+        default: T,
         *,
         low: Any = None,
         high: Any = None,
         unit: str = "",
         help: str = "",  # noqa: A002
         choices: Iterable[Any] | None = None,
-        on_change: Callable[[Any], Any] | None = None,
-    ) -> Parameter:
+        on_change: Callable[[T], Any] | None = None,
+    ) -> Parameter[T]:
         """Declare a parameter in the dict here, and return it: `float(kp)` and `kp.value` are always current.
 
         Example:
@@ -471,7 +472,8 @@ class Accessor(Handle):
         Args:
             name: The key in the dict here, which is made if it is missing.
             default: A bool, int, float, str, or a list or array of up to 64 numbers. It decides the type: a parameter
-                with the default 2 takes no 2.5.
+                with the default 2 takes no 2.5. Or an object of a dataclass, `msgspec.Struct` or `pydantic.BaseModel`:
+                each of its fields is a parameter, with the bounds that the class gives it, and `value` is an object.
             low: The least number; of a vector also a vector. None for no bound.
             high: The greatest number, likewise.
             unit: Such as "1/s"; for people.
@@ -519,11 +521,13 @@ class Accessor(Handle):
         return await call(self._reader.session, self._reader.keys, self._path, arguments, timeout)
 
     @overload
-    def serve(self, function: Callable[..., Any], *, concurrency: int = 1, queue: int = QUEUE) -> Service: ...
+    def serve(
+        self, function: Callable[Arguments, Result], *, concurrency: int = 1, queue: int = QUEUE
+    ) -> Service[Arguments, Result]: ...
     @overload
     def serve(
         self, function: None = None, *, concurrency: int = 1, queue: int = QUEUE
-    ) -> Callable[[Callable[..., Any]], Service]: ...
+    ) -> Callable[[Callable[Arguments, Result]], Service[Arguments, Result]]: ...
 
     def serve(self, function: Callable[..., Any] | None = None, *, concurrency: int = 1, queue: int = QUEUE) -> Any:
         """Answer calls of the service at this place with a function: `@kvs["policy"].serve`, or with a `with` block.
@@ -555,7 +559,9 @@ class Accessor(Handle):
         service.begin()
         return service
 
-    def _service(self, function: Callable[..., Any], concurrency: int, queue: int) -> Service:
+    def _service(
+        self, function: Callable[Arguments, Result], concurrency: int, queue: int
+    ) -> Service[Arguments, Result]:
         return Service(self._reader.session, self._reader.keys, self._path, function, concurrency, queue)
 
     def own(self, *, ttl: float = 0.2, name: str | None = None, take: bool = False) -> OwnedAccessor:

@@ -10,6 +10,7 @@ from ..concurrency.queues import Policy
 from ..concurrency.streams import Following
 from ..errors import BadData, BadType, MissingKey
 from ..plan import typed
+from ..plan.classes import fields_of
 from ..plan.paths import Path, show
 from ..plan.trees import MISSING
 from ..pubsub.events import Update
@@ -119,6 +120,17 @@ class View(Generic[T]):
         """Return a local copy of the object here that follows every change. As `Accessor.mirror`."""
         return ViewMirror(self._accessor.mirror(max_age=max_age, stale=stale, ttl=ttl), self)
 
+    async def call(self, /, *, timeout: float | None = None, **arguments: Any) -> T:  # noqa: ASYNC109
+        """Ask the service at this place, and return its answer as an object of the class. As `Accessor.call`.
+
+        Raises:
+            BadData: The answer is not what the class says; names path, expected and found.
+        """
+        return self._made(await self._accessor.call(timeout=timeout, **arguments))
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *(fields_of(self._annotation) or ())]
+
     def _made(self, value: Any) -> T:
         return typed.made(self._annotation, value, self._accessor.full_path)  # type: ignore[no-any-return]
 
@@ -195,6 +207,20 @@ class ViewMirror(Following, Generic[T]):
             Stale, Silent: As `Mirror.value`.
         """
         return mirrored(self._mirror, self._view, default)
+
+    async def wait_until(self, predicate: Callable[[T], Any], timeout: float | None = None) -> T:  # noqa: ASYNC109
+        """Wait until the object is as wanted; returns it. As `Mirror.wait_until`.
+
+        The predicate is not called while nothing is stored here. Raises BadData for what is not what the class says.
+        """
+        return self._view._made(await self._mirror.wait_until(wanted(self._view, predicate), timeout))
+
+
+def wanted(view: View[T], predicate: Callable[[T], Any]) -> Callable[[Any], Any]:
+    """Return a predicate for the mirror of a view."""
+    if not callable(predicate):  # which the mirror refuses
+        return predicate
+    return lambda value: value is not None and predicate(view._made(value))
 
 
 def mirrored(mirror: Any, view: View[T], default: tuple[T, ...]) -> T:
