@@ -5,6 +5,7 @@ import json
 import struct
 import tracemalloc
 
+import mcap.reader
 import mcap.writer
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 from PIL import Image
 
-from reem_async import KeyValueStore
-from reem_async.recording import DamagedRecording, Replayer, open_log
+from reem_async import KeyValueStore, PublishSpace
+from reem_async.errors import BadData, BadType, BadValue
+from reem_async.recording import DamagedRecording, Recorder, Replayer, open_log
 from reem_async.ships import Jpeg
 from reem_async.tools.recording.cdr import compiled
 
@@ -184,6 +186,8 @@ def test_protobuf_and_json(tmp_path):
     out = invoked("log", "info", str(path)).stdout
     assert "1 message of /cbor: encoding 'cbor'" in out
     assert "by another program: " in out
+    with open_log(path) as log:
+        assert log.undecoded == reasons
 
 
 HOSTILE = {
@@ -358,3 +362,79 @@ async def test_played(ros, ainterface, key):
         assert plain(stored) == state(9)
         frame = await KeyValueStore(ainterface)[names["eye/bgr"]]["data"].read()
         assert (frame == log["eye/bgr.data"].at(log.end)).all()
+
+
+def split_up(ros, tmp_path):
+    """Return the messages of a file in two others, as a recorder that splits would have written them."""
+    files = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    with ros.open("rb") as source:
+        rows = list(mcap.reader.make_reader(source).iter_messages())
+    for file, part in zip(files, (rows[:23], rows[23:]), strict=True):
+        with file.open("wb") as stream:
+            writer = mcap.writer.Writer(stream, chunk_size=5000)
+            writer.start()
+            numbers = {}
+            # In another order, so channels and schemas have other numbers in each file.
+            for schema, channel, _ in sorted(part, key=lambda row: row[1].topic, reverse=file == files[1]):
+                if channel.topic not in numbers:
+                    about = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    numbers[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, about)
+            for _, channel, it in part:
+                writer.add_message(numbers[channel.topic], it.log_time, it.data, it.publish_time, it.sequence)
+            writer.finish()
+    return files
+
+
+def rows_of(log):
+    return [(it.time, it.published, it.sequence, it.shown, plain(it.value)) for it in log.updates()]
+
+
+def test_several_files_as_one(ros, tmp_path):
+    one, two = split_up(ros, tmp_path)
+    with open_log(ros) as whole, open_log([two, one]) as log:
+        assert log.files == [one, two]
+        assert rows_of(log) == rows_of(whole)
+        assert (log.start, log.end, log.names(), log.damaged) == (whole.start, whole.end, whole.names(), 0)
+        for instant in np.linspace(log.start, log.end, 30):
+            assert plain(log.value_at("", instant)) == plain(whole.value_at("", instant))
+        assert [plain(it) for it in log["arm/state.position"].history()] == [
+            plain(it) for it in whole["arm/state.position"].history()
+        ]
+        summaries = [[(it.topic, it.messages, it.first, it.last) for it in each.channels()] for each in (log, whole)]
+        assert summaries[0] == summaries[1]
+        assert log.verify() == 0
+    damaged = bytearray(two.read_bytes())
+    damaged[len(damaged) // 3] ^= 0xFF
+    two.write_bytes(damaged)
+    with open_log([one, two]) as log:
+        assert log.verify() == log.damaged == 1
+        assert 0 < len(list(log.updates())) < 50
+        assert plain(log["arm/state"].at(log.start)) == state(0)
+    with pytest.raises(BadValue, match=r"one\.mcap are one file"):
+        open_log([one, one])
+    with pytest.raises(BadData, match="not an MCAP file"):
+        open_log([one, __file__])
+    for nothing in ([], 7, b"x"):
+        with pytest.raises(BadType):
+            open_log(nothing)
+    out = invoked("log", "info", one, two, "--verify")
+    assert (out.returncode, "in 5 channels" in out.stdout) == (1, True)
+    out = invoked("log", "export", one, "--with", two, "eye/odd", "-o", tmp_path / "x.csv")
+    assert "10 rows" in out.stdout
+
+
+async def test_files_of_reem_and_of_others(ros, ainterface, key, tmp_path):
+    """A recording of REEM beside one of ROS, though a key and a topic have one name."""
+    name, file = key("arm"), tmp_path / "run.mcap"
+    async with Recorder(ainterface, [f"{name}*"], file):
+        space = PublishSpace(ainterface)
+        await space[name].write({"q": [1.5], "image": picture(20, 24)})
+        await space[name]["q"].write([2.5])
+    with open_log([file, ros]) as log, open_log(file) as own:
+        assert log.damaged == 0
+        assert log.names() == sorted([name, "arm/state", "eye/bgr", "eye/jpeg", "eye/mono", "eye/odd"])
+        assert [row for row in rows_of(log) if row[3].startswith(name)] == rows_of(own)
+        assert plain(log[name].at(log.end)) == plain(own[name].at(own.end))
+        assert plain(log["arm/state"].at(log.end)) == state(9)
+        assert log.metadata["host"] == own.metadata["host"]
+        assert {each.role for each in log.channels()} > {"update", "keyframe"}

@@ -49,20 +49,21 @@ class LogSource(Source):
     Reading takes place in a thread, one at a time.
 
     Args:
-        path: The file that `reem record` wrote.
+        path: The file that `reem record` or another program wrote, or several that are shown as one.
         ships: What makes values of what is not JSON; None for the default ones.
 
     Raises:
-        DamagedRecording: It is no recording of REEM.
+        DamagedRecording: It is no recording.
         OSError: It cannot be read.
     """
 
     live = False
     writable = False
 
-    def __init__(self, path: str | FilePath, ships: Sequence[Any] | None = None) -> None:
-        self.title = FilePath(path).name
+    def __init__(self, path: str | FilePath | Sequence[FilePath], ships: Sequence[Any] | None = None) -> None:
         self.log: Log = open_log(path, ships).raw  # pictures are shown as they are
+        more = len(self.log.files) - 1
+        self.title = self.log.path.name + (f" and {more} more" if more else "")
         # When there was news of a path, sorted; read when it is asked for, since all of a long recording takes seconds.
         self._times = lru_cache(_CACHED)(self.log.news_times)
         self._state = lru_cache(_CACHED)(self._read_state)
@@ -79,6 +80,8 @@ class LogSource(Source):
         notes = [] if self.log.indexed else ["the recording was not ended properly"]
         if self.log.damaged:
             notes.append(f"{self.log.damaged} damaged records are skipped")
+        if self.log.undecoded:
+            notes.append(f"{len(self.log.undecoded)} topics are left out, see reem log info")
         start, end = (instant and instant + _ROUNDING for instant in (self.log.start, self.log.end))
         return Status(start, end, "", "; ".join(notes))
 
@@ -86,7 +89,8 @@ class LogSource(Source):
         """Do nothing: a recording is read only for a page."""
 
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
-        code = f"from reem.recording import open_log\n\nlog = open_log({str(self.log.path.resolve())!r})\n"
+        files = [str(file.resolve()) for file in self.log.files]
+        code = f"from reem.recording import open_log\n\nlog = open_log({(files if files[1:] else files[0])!r})\n"
         when = "log.end" if at is None else repr(at)
         return {"recording": f"{code}value = log[{path!r}].at({when})\ntimes, values = log[{path!r}].history()\n"}
 

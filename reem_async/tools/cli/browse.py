@@ -40,7 +40,15 @@ def browse(
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
     log: Annotated[
-        Path | None, typer.Option("--log", metavar="FILE", callback=existing, dir_okay=False, help="Show a recording.")
+        list[Path] | None,
+        typer.Option(
+            "--log",
+            metavar="FILE",
+            callback=existing,
+            dir_okay=False,
+            show_default=False,
+            help="Show a recording; several are shown as one.",
+        ),
     ] = None,
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Where to listen; other machines need a token.")
@@ -73,7 +81,7 @@ def browse(
 
     def work() -> int | None:
         check_packages(log)
-        if log is not None and allow_write:
+        if log and allow_write:
             raise CommandFailed("a recording is not changed: leave out --allow-write, or --log", USAGE)
         source = _source(url, namespace, log, buffer, memory, named_ships(ships))
         asyncio.run(_serve(source, host, port, allow_write, open_))
@@ -82,7 +90,7 @@ def browse(
     run_local("browse", work, live=True)
 
 
-def check_packages(log: Path | None) -> None:
+def check_packages(log: list[Path] | None) -> None:
     # Looked for before anything is imported, so that all that is missing is named at once.
     needed = _PACKAGES | ({"mcap": "mcap"} if log else {})
     absent = [name for module, name in needed.items() if find_spec(module) is None]
@@ -90,9 +98,9 @@ def check_packages(log: Path | None) -> None:
         raise CommandFailed(f"needs {', '.join(absent)}: pip install 'reem-async[tools]'")
 
 
-def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: int, ships: list[Any]) -> Source:
+def _source(url: str, namespace: str, log: list[Path] | None, buffer: float, memory: int, ships: list[Any]) -> Source:
     """Return what to show. Made outside of the event loop, in which it is used."""
-    if log is not None:
+    if log:
         from ..browser.logsource import LogSource
 
         return LogSource(log, ships)

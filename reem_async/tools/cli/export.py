@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ...errors import BadValue
-from .options import AsJson, Force, Only, Recording
+from .options import AsJson, Force, More, Only, Recording
 from .output import clean, counted, emit, emit_json, note, progress_bar, size_text
 from .running import run_local
 
@@ -35,6 +35,7 @@ def _paths(name: str, what: str) -> Any:
 def export(
     file: Recording,
     patterns: Only = None,
+    more: More = None,
     to: Annotated[
         str | None,
         typer.Option(
@@ -123,12 +124,12 @@ def export(
         if rate is None:
             if state or action or image:
                 raise BadValue("--state, --action and --image make a training set, which needs --rate")
-            return _table(file, patterns, to, output, force=force, as_json=as_json)
+            return _table([file, *(more or ())], patterns, to, output, force=force, as_json=as_json)
         if patterns:
             raise BadValue(f"with --rate, name paths with --state, --action or --image, not {patterns[0]}")
         kind = _format(to, output, ("parquet", "npz", "lerobot"))
         target = output or file.with_suffix(".lerobot" if kind == "lerobot" else f".{kind}")
-        with progress_bar() as bar, open_log(file, progress=bar("opening")) as log:
+        with progress_bar() as bar, open_log([file, *(more or ())], progress=bar("opening")) as log:
             frames = TrainingSet(
                 log,
                 rate=rate,
@@ -190,7 +191,7 @@ def _line(each: ExportedEpisode) -> str:
 
 
 def _table(
-    file: Path, patterns: list[str] | None, to: str | None, output: Path | None, *, force: bool, as_json: bool
+    files: list[Path], patterns: list[str] | None, to: str | None, output: Path | None, *, force: bool, as_json: bool
 ) -> int:
     from ..recording import open_log
     from ..recording.export import FORMATS
@@ -199,8 +200,8 @@ def _table(
     kind, to_stdout = _format(to, output, tuple(FORMATS)), output == _STDOUT
     if to_stdout and as_json:
         raise BadValue("--json and the export would both be on the standard output; name a file with -o")
-    with open_log(file) as log, ExitStack() as stack:
-        target = output or file.with_suffix(f".{kind}")
+    with open_log(files) as log, ExitStack() as stack:
+        target = output or files[0].with_suffix(f".{kind}")
         if to_stdout:
             target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "export"
         result = write(log, kind, target, patterns or ["*"], overwrite=force)

@@ -17,7 +17,7 @@ import typer
 from ...connection import RedisInterface
 from .export import export
 from .following import progress
-from .options import AsJson, Only, Recording, with_server
+from .options import AsJson, More, Only, Recording, with_server
 from .output import clean, columns, counted, emit, emit_json, figures, named, progress_bar, size_text, styled
 from .running import USAGE, CommandFailed, run_local
 
@@ -33,6 +33,7 @@ async def play(
     interface: RedisInterface,
     file: Recording,
     patterns: Only = None,
+    more: More = None,
     rate: Annotated[
         float, typer.Option("--rate", "-r", min=0.001, max=1_000_000, metavar="N", help="N times as fast as it was.")
     ] = 1.0,
@@ -57,11 +58,12 @@ async def play(
         reem play run.mcap
         reem play run.mcap --start 12.5 --rate 0.5 --loop
         reem play run.mcap 'cam_*' --remap cam_left=camera
+        reem play run-0001.mcap --with run-0002.mcap
     """
     from ..recording import Replayer, open_log
 
     names = dict(_pair(text) for text in remap or ())
-    with open_log(file) as log:
+    with open_log([file, *(more or ())]) as log:
         replayer = Replayer(
             interface,
             log,
@@ -163,7 +165,7 @@ app = typer.Typer(
 
 @app.command()
 def info(
-    file: Recording,
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The recording; several are read as one.")],
     verify: Annotated[bool, typer.Option("--verify", help="Read all of the file and count what is damaged.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -179,7 +181,7 @@ def info(
 
         with ExitStack() as stack:
             with progress_bar() as bar:
-                log = stack.enter_context(open_log(file, progress=bar("opening")))
+                log = stack.enter_context(open_log(files, progress=bar("opening")))
                 if verify:
                     log.verify(bar("checking"))
                 channels = log.channels(bar("counting"))
@@ -195,7 +197,8 @@ def info(
 def _summary(log: Log, channels: list[ChannelSummary]) -> dict[str, Any]:
     return {
         "file": str(log.path),
-        "bytes": log.path.stat().st_size,
+        "files": [str(file) for file in log.files],
+        "bytes": _size(log),
         "start": log.start,
         "end": log.end,
         "duration": log.duration,
@@ -205,6 +208,10 @@ def _summary(log: Log, channels: list[ChannelSummary]) -> dict[str, Any]:
         "metadata": log.metadata,
         "channels": [asdict(each) | {"rate": each.rate} for each in channels],
     }
+
+
+def _size(log: Log) -> int:
+    return sum(file.stat().st_size for file in log.files)
 
 
 def _print(log: Log, channels: list[ChannelSummary]) -> None:
@@ -228,7 +235,7 @@ def _print(log: Log, channels: list[ChannelSummary]) -> None:
     columns(rows, ("bold", "", "cyan", "", "yellow", "green"), right=frozenset({3, 4, 5}), shrink=(0, 2, 1))
     emit("")
     lines = [
-        ("file", f"{log.path}, {size_text(log.path.stat().st_size)}, {complete}{damage}"),
+        ("file", f"{named([str(file) for file in log.files])}, {size_text(_size(log))}, {complete}{damage}"),
         ("time", f"{_when(log.start)} to {_when(log.end)}, {log.duration:.1f} s"),
         ("messages", f"{sum(each.messages for each in channels)} in {len(channels)} channels"),
     ]
@@ -236,7 +243,7 @@ def _print(log: Log, channels: list[ChannelSummary]) -> None:
         profile = f", profile {metadata['profile']}" if metadata.get("profile") else ""
         lines.append(("recorded", f"by another program: {metadata.get('library') or 'unnamed'}{profile}"))
         lines += [("skipped", text) for text in _skipped(channels)]
-    else:
+    if metadata.get("host") or not log.foreign:
         who = f"{metadata.get('user', '')}@{metadata.get('host', '')}"
         lines.append(("recorded", f"{metadata.get('patterns') or 'samples'} by {who}"))
         lines += [("server", metadata.get("server", "")), ("missing", _missing(log))]

@@ -10,7 +10,7 @@ from contextlib import suppress
 from importlib import import_module
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -123,6 +123,12 @@ Value = Annotated[
 Text = Annotated[bool, typer.Option("--str", help="VALUE is text, not JSON; - still reads the input.")]
 Publish = Annotated[bool, typer.Option("--publish", help="Notify subscribers, as a PublishSpace does.")]
 Recording = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
+More = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--with", metavar="FILE", show_default=False, help="Another file, read as one with the first; may be repeated."
+    ),
+]
 Only = Annotated[list[str] | None, typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths.")]
 Output = Annotated[
     Path | None,
@@ -131,11 +137,18 @@ Output = Annotated[
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it is there already.")]
 
 
-def existing(ctx: typer.Context, file: Path | None) -> Path | None:
+Given = TypeVar("Given", Path, list[Path], None)
+
+
+def existing(ctx: typer.Context, given: Given) -> Given:
     """End with exit code 3 if a file that is to be read is not there: a callback of options."""
-    if file is not None and not file.exists():
-        raise typer.Exit(complain(ctx.command_path.partition(" ")[2], f"{file}: No such file or directory", NOTHING))
-    return file
+    files: list[Path] = given if isinstance(given, list) else [] if given is None else [given]
+    for file in files:
+        if not file.exists():
+            raise typer.Exit(
+                complain(ctx.command_path.partition(" ")[2], f"{file}: No such file or directory", NOTHING)
+            )
+    return given
 
 
 Count = Annotated[int | None, typer.Option("--count", "-n", min=1, metavar="N", help="End after N updates.")]

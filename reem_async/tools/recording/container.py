@@ -272,6 +272,14 @@ class Container:
         self.damaged += not self.damaged and self._messages not in (None, scan.messages)
         return scan.contents
 
+    def parts(self) -> list[tuple[Container, dict[int, Channel]]]:
+        """Return the files and the channels of each: this one."""
+        return [(self, self.channels)]
+
+    def numbers_in(self, info: ChunkInfo, channels: Numbers) -> Numbers:
+        """Return the numbers that channels have in the content of a chunk."""
+        return channels
+
     def header(self) -> dict[str, str]:
         """Return which profile and library the file names; nothing if that is damaged."""
         try:
@@ -283,10 +291,16 @@ class Container:
             return {}
         return {"profile": header.profile, "library": header.library}
 
-    def close(self) -> None:
+    def forget(self) -> None:
+        """Let go of the chunks and indexes in memory."""
         with self._lock:
             self._cache.clear()
             self._indexes.clear()
+            self._cached = self._entries = 0
+
+    def close(self) -> None:
+        with self._lock:
+            self.forget()
             self._source.close()
 
     @property

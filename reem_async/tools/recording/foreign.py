@@ -27,8 +27,9 @@ from ...plan.paths import Path, check_top_key
 from ...plan.trees import MISSING, get
 from ...ships.images import EncodedImage, Jpeg, Png
 from .cdr import compiled
-from .container import Container, Ref
+from .container import Ref
 from .format import DamagedRecording
+from .joined import Files
 from .layout import picture_format
 from .stored import LOST, Reference, extract, reference_to
 
@@ -42,17 +43,17 @@ Decode = Callable[[bytes], Any]
 
 
 class Foreign:
-    """The channels of a file that are not REEM's."""
+    """The channels of files that other programs have written."""
 
-    def __init__(self, container: Container) -> None:
+    def __init__(self, container: Files, channels: Mapping[int, Channel]) -> None:
         self.keys: dict[int, str] = {}
         self.skipped: dict[int, str] = {}  # why the others are left out
         self._container = container
         self._decoders: dict[int, Decode] = {}
         self._message = lru_cache(_KEPT)(self._decoded)
         known: dict[tuple[str, int], Decode | str] = {}
-        topics = {channel.topic for channel in container.channels.values()}
-        for number, channel in container.channels.items():
+        topics = {channel.topic for channel in channels.values()}
+        for number, channel in channels.items():
             kind = channel.message_encoding, channel.schema_id
             if kind not in known:
                 known[kind] = _decoder(channel, container.schemas.get(channel.schema_id))

@@ -20,9 +20,10 @@ from ...ships.base import SpecialDatatypeShip
 from ...ships.registry import Ships, default_ships
 from ...transport.protocol import CommandRecorder
 from .align import CLOCKS, Alignment, at_rate, by_clock, stacked
-from .container import Container, Ref
+from .container import Ref
 from .episodes import Episode, episodes_of
 from .format import NEWS, Role
+from .joined import open_files
 from .log_reader import RecordedPast, RecordedStream
 from .places import Totals
 from .stored import LOST, Reference, pruned, resolve
@@ -128,7 +129,7 @@ class ChannelSummary:
 
 
 def open_log(
-    path: str | FilePath,
+    path: str | FilePath | Sequence[str | FilePath],
     ships: Sequence[SpecialDatatypeShip] | None = None,
     *,
     progress: Callable[[int, int], None] | None = None,
@@ -143,13 +144,15 @@ def open_log(
     is open, the old one is read on. If it cuts the file short, a read beyond the new end raises OSError.
 
     Args:
-        path: The file.
+        path: The file, or several that are read as one: the parts of a recording, or recordings of several programs at
+            the same time. What was deleted between two recordings seems to be there until the end.
         ships: What makes values of what is not JSON; those of an interface if not given.
         progress: Called with the bytes done and all of them, if the whole file is read: its recorder was killed, or its
             summary is damaged or leaves something out.
 
     Raises:
         DamagedRecording: Not an MCAP file, or without a channel.
+        BadValue: One file is given twice.
         OSError: The file cannot be read.
     """
     return Log(path, ships, progress=progress)
@@ -158,19 +161,21 @@ def open_log(
 class Log:
     """A recording, as `open_log` opens it. `log["foo.bar"].at(t)` is what was at foo.bar at the instant t.
 
+    `path` is its file, the first one in time if it has several, and `files` are all of them.
     Instants are seconds since 1970 as float, on the clock of the recorder, or numpy datetime64.
     Any thread may use it; nothing here waits for a server.
     """
 
     def __init__(
         self,
-        path: str | FilePath,
+        path: str | FilePath | Sequence[str | FilePath],
         ships: Sequence[SpecialDatatypeShip] | None = None,
         *,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        self.path = FilePath(path)
-        self._container = Container(self.path, progress)
+        self._container = open_files(path, progress)
+        self.files = [file.path for file, _ in self._container.parts()]
+        self.path = self.files[0]
         try:
             self._past = past = RecordedPast(
                 self._container, Ships(default_ships() if ships is None else ships, CommandRecorder)
@@ -225,8 +230,13 @@ class Log:
 
     @property
     def foreign(self) -> bool:
-        """Whether another program has recorded it."""
-        return self._past.foreign is not None
+        """Whether another program has recorded it, or a part of it."""
+        return bool(self._past.foreign.keys or self._past.foreign.skipped)
+
+    @property
+    def undecoded(self) -> dict[str, str]:
+        """The topics of other programs that are left out, and why."""
+        return {self._container.channels[number].topic: why for number, why in self._past.foreign.skipped.items()}
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -234,9 +244,7 @@ class Log:
 
         Of a recording of another program, the profile and the library that the file names.
         """
-        if self.foreign:
-            return self._container.header()
-        said: dict[str, str] = {}
+        said: dict[str, str] = self._container.header() if self.foreign else {}
         for record in self._container.metadata:
             if record.name == "reem":
                 said.update(record.metadata)
@@ -481,7 +489,7 @@ class Log:
             place = (show(stream.path), stream.role.value, stream.kind.value) if stream else ("", "", "")
             messages, size, first, last = totals.get(channel.id, Totals())
             title, span = schema.name if schema else "", (seconds(first), seconds(last))
-            skipped = self._past.foreign.skipped.get(channel.id, "") if self._past.foreign else ""
+            skipped = self._past.foreign.skipped.get(channel.id, "")
             found.append(ChannelSummary(channel.topic, *place, title, messages, size, *span, skipped))
         return sorted(found, key=lambda it: (it.topic, it.role, it.path))
 

@@ -7,7 +7,7 @@ import itertools
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import orjson
 from mcap.records import Channel, Metadata
@@ -21,6 +21,7 @@ from ...ships.registry import Ships
 from .container import Container, Ref
 from .foreign import Foreign
 from .format import NEWS, DamagedRecording, Kind, Role
+from .joined import Files
 from .layout import PathReader, decode, from_json
 from .places import Timeline, messages_in
 from .sink import CHANNELS
@@ -48,31 +49,34 @@ _DAMAGED = object()
 class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     """The contents of a recording. Positions of changes are log times, in ns."""
 
-    def __init__(self, container: Container, ships: Ships) -> None:
+    def __init__(self, container: Files, ships: Ships) -> None:
         self._container = container
         self._ships = ships
-        self.timeline = Timeline(container)
+        self.timeline = Timeline(cast("Container", container))  # or what has its methods
         self.unreadable = 0  # values that were left out, since they are damaged or were not recorded
         self._has_skipped = False
         by_place: dict[tuple[Path, str, str], RecordedStream] = {}
         self.of_channel: dict[int, RecordedStream] = {}
         # A path has several channels in one role if its type changed: for users they are one stream.
-        for channel in container.channels.values():
-            place = _place(channel.metadata)
-            if place is not None:
-                stream = by_place.setdefault(place, RecordedStream(*place, []))
-                stream.channels.append(channel.id)
-                self.of_channel[channel.id] = stream
-        is_described = any(record.name == "reem" for record in container.metadata)
-        if not container.channels and not is_described:
-            raise DamagedRecording(f"{container.path} is an MCAP file without a channel: it holds nothing")
-        self.foreign = None if by_place or is_described else Foreign(container)
-        if self.foreign is None:
-            container.damaged += self._missing(is_described)
-        for number, key in () if self.foreign is None else self.foreign.keys.items():
+        others: dict[int, Channel] = {}  # of files that another program has written
+        for file, channels in container.parts():
+            places = {number: _place(channel.metadata) for number, channel in channels.items()}
+            is_described = any(record.name == "reem" for record in file.metadata)
+            if not is_described and not any(places.values()):
+                others |= channels
+                if not channels:
+                    raise DamagedRecording(f"{file.path} is an MCAP file without a channel: it holds nothing")
+                continue
+            file.damaged += _missing(file, is_described)
+            for number, place in places.items():
+                if place is not None and number not in self.of_channel:
+                    self.of_channel[number] = by_place.setdefault(place, RecordedStream(*place, []))
+                    self.of_channel[number].channels.append(number)
+        self.foreign = Foreign(container, others)
+        for number, key in self.foreign.keys.items():
             place = (key,), Role.UPDATE, Kind.PUBLISHED
-            self.of_channel[number] = stream = by_place.setdefault(place, RecordedStream(*place, []))
-            stream.channels.append(number)
+            self.of_channel[number] = by_place.setdefault(place, RecordedStream(*place, []))
+            self.of_channel[number].channels.append(number)
         self.streams = list(by_place.values())
         self.names: dict[str, list[RecordedStream]] = {}
         self._parts: dict[Path, list[int]] = {}
@@ -82,19 +86,6 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 self.names.setdefault(str(stream.path[0]), []).append(stream)
             if stream.role in (Role.PART, Role.UPDATE):
                 self._parts.setdefault(stream.path, []).extend(stream.channels)
-
-    def _missing(self, is_described: bool) -> int:
-        """Return how many channels another tool has left out of keys that are still there.
-
-        Without the channel of its deletions, for example, a key would seem to hold what was deleted.
-        """
-        channels = self._container.channels.values()
-        if not is_described:  # nor are the notes on channels there; but each recording has topics of its own
-            return int(not any(channel.topic.startswith("/_reem/") for channel in channels))
-        names = {stream.path[0] for stream in self.of_channel.values()}
-        listed = Counter(_listed(self._container.metadata, names))
-        listed.subtract(str(sorted(channel.metadata.items())) for channel in channels)
-        return sum(count for count in listed.values() if count > 0)
 
     def tree(self, path: Path, until: int) -> Any:
         """Return what was at a full path at an instant (ns), long arrays as `Reference`; or MISSING."""
@@ -182,7 +173,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         """Return the value of a message, MISSING for a deletion; raises _FoundDamage, BadData."""
         if stream.role == Role.DELETE:
             return MISSING
-        if self.foreign is not None:
+        if ref.channel in self.foreign.keys:
             found = self.foreign.tree(ref)
             if found is MISSING:
                 raise _FoundDamage
@@ -202,7 +193,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         except (_FoundDamage, BadData):
             value = _DAMAGED
         # What another program has recorded, and cannot be decoded, is no part of any update.
-        if value is _DAMAGED or (self.foreign is not None and type(value) is Reference and value.label == LOST):
+        if value is _DAMAGED or (ref.channel in self.foreign.keys and type(value) is Reference and value.label == LOST):
             self.unreadable += 1
             self._has_skipped = True
             return _DAMAGED
@@ -228,7 +219,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         """Return the value that something stands for; raises DamagedRecording."""
         if it.label == LOST:
             raise DamagedRecording(f"{it.shown}: {it.summary}")
-        if self.foreign is not None and it.where is not None:
+        if it.where is not None:
             value = self.foreign.value(it)
             if not isinstance(value, EncodedImage):
                 return value
@@ -324,7 +315,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         streams = [it for it in self._streams_of(path) if it.role in roles and related(it.path, path)]
         at, last = after, MISSING
         is_whole = self._anchor(path) == path and all(len(it.path) <= len(path) for it in streams)
-        if not is_whole or self.foreign is not None:
+        if not is_whole or any(channel in self.foreign.keys for it in streams for channel in it.channels):
             return at, last
         readers = {channel: self._reader(channel, path) for it in streams for channel in it.channels}
         for batch in self.timeline.batches(readers, after, until):
@@ -334,7 +325,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             channel = int(batch.channels[0])
             reader, stream = readers[channel], self.of_channel[channel]
             if reader is not None and stream.role == Role.UPDATE and (batch.channels == channel).all():
-                texts = messages_in(content, batch)
+                texts = messages_in(content, batch, self._container.numbers_in(batch.chunk, batch.channels))
                 trees = None if texts is None else reader.read(texts)
                 if trees is not None:
                     times = batch.times.tolist()
@@ -404,6 +395,20 @@ def _listed(metadata: Iterable[Metadata], names: set[str | int]) -> Iterator[str
                 place = _place(row[4])
                 if place is not None and place[0][0] in names:
                     yield str(sorted(row[4].items()))
+
+
+def _missing(file: Container, is_described: bool) -> int:
+    """Return how many channels another tool has left out of keys that are still there.
+
+    Without the channel of its deletions, for example, a key would seem to hold what was deleted.
+    """
+    channels = file.channels.values()
+    if not is_described:  # nor are the notes on channels there; but each recording has topics of its own
+        return int(not any(channel.topic.startswith("/_reem/") for channel in channels))
+    places = [_place(channel.metadata) for channel in channels]
+    listed = Counter(_listed(file.metadata, {place[0][0] for place in places if place is not None}))
+    listed.subtract(str(sorted(channel.metadata.items())) for channel in channels)
+    return sum(count for count in listed.values() if count > 0)
 
 
 def _place(metadata: Mapping[str, str]) -> tuple[Path, Role, Kind] | None:

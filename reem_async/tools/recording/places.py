@@ -33,13 +33,16 @@ _HEADS = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("se
 _HEAD_BYTES = np.arange(_HEADS.itemsize)
 
 
-def messages_in(content: bytes, batch: Batch) -> list[bytes] | None:
-    """Return the data of messages in the content of their chunk; None if one is not what the index names."""
+def messages_in(content: bytes, batch: Batch, channels: Numbers) -> list[bytes] | None:
+    """Return the data of messages in the content of their chunk; None if one is not what the index names.
+
+    `channels` are those of the batch by the numbers that they have in the content.
+    """
     offsets = batch.offsets.astype(np.int64)
     if offsets.min() < 0 or offsets.max() + MESSAGE.size > len(content):
         return None
     heads = np.frombuffer(content, np.uint8)[offsets[:, None] + _HEAD_BYTES].view(_HEADS).reshape(-1)
-    is_named = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == batch.channels)
+    is_named = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channels)
     lengths = np.minimum(heads["length"], len(content)).astype(np.int64)
     ends = offsets + HEAD.size + lengths
     if not (is_named & (heads["time"] == batch.times) & (ends <= len(content))).all():

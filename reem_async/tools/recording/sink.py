@@ -42,6 +42,10 @@ KEYFRAMES = "/_reem/keyframe"
 OPERATIONS = "/_reem/ops"
 CHANNELS = "reem.channels"
 """The name of the metadata records that list channels."""
+SPLIT = "split"
+"""In the metadata of a file that is a part of a recording: what all parts have, and which of them it is."""
+CONTINUED = "reem.continued"
+"""In the metadata of a channel: its messages repeat what the part before has ended with."""
 _SHARED_TOPICS = {
     **dict.fromkeys((Role.STATE, Role.KEYFRAME), KEYFRAMES),
     **dict.fromkeys((Role.DELETE, Role.GAP, Role.SKIP), OPERATIONS),
