@@ -2,8 +2,11 @@
 
 # ruff: noqa: F811 - fixtures are named as arguments
 import contextlib
+import itertools
+import json
 import re
 import time
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -346,20 +349,75 @@ def test_a_depth_image_with_holes_and_a_path_of_points(visit, pspace, key):
 
 
 @pytest.mark.long
-def test_the_first_page_shows_busy_keys_and_what_is_pinned_instead(visit, pspace, key):
+def test_the_first_page_shows_what_is_pinned_and_busy_keys_but_no_clocks_and_counters(visit, pspace, key):
     pspace[key("busy")] = {"x": 0.0}
     pspace[key("quiet")] = {"y": 5.0}
     page = visit.open("/")
     busy = page.locator(f'.pane .pane-head a[title="{key("busy")}.x"]')
-    keep_publishing(page, lambda number: pspace[key("busy")].__setitem__("x", float(number)), lambda: busy.count() == 1)
-    expect(page.locator("#view h2")).to_have_text("Busiest keys")
+
+    numbers = itertools.count()
+
+    def publish(_):
+        number, stamp = next(numbers), time.time()
+        pspace[key("busy")] = {"x": float(number % 7), "seq": number, "stamp": stamp, "nanoseconds": int(stamp * 1e9)}
+
+    keep_publishing(page, publish, lambda: busy.count() == 1)
+    heads = page.locator("#view h2:visible")
+    titles = page.locator(".pane .pane-head a")
+    expect(heads).to_have_text("Busiest keys")
     page.goto(page.url + f"view/{key('quiet')}.y")
     page.get_by_role("button", name="Pin", exact=True).click()
     page.locator("a.brand").click()
-    expect(page.locator("#view h2")).to_have_text("Pinned")
-    expect(page.locator(".pane .pane-head a")).to_have_text([f"{key('quiet')}.y"])
+    keep_publishing(page, publish, lambda: titles.count() == 2)
+    expect(heads).to_have_text(["Pinned", "Busiest keys"])
+    expect(titles).to_have_text([f"{key('quiet')}.y", f"{key('busy')}.x"])
+    page.get_by_label("busiest keys").uncheck()
+    expect(titles).to_have_text([f"{key('quiet')}.y"])
     page.locator(".pin").click()
-    expect(page.locator("#view h2")).not_to_have_text("Pinned")
+    expect(heads).to_have_count(0)
+
+
+@pytest.mark.long
+def test_a_layout_is_saved_by_a_name_and_an_address_leads_to_it(visit, pspace, kvs, key):
+    pspace[key()] = {"y": 5.0, 'an "odd" [key]': {"z": 1.5}}
+    name = key()
+    page = visit.open(f"/view/{name}.y")
+    page.get_by_role("button", name="Pin", exact=True).click()
+    page.get_by_role("button", name="Logarithmic axis").click()
+    page.locator("a.brand").click()
+    page.get_by_role("button", name="Save…").click()
+    page.get_by_label("Name of the layout").fill("a.b")
+    page.get_by_role("button", name="Save", exact=True).click()
+    expect(page.locator(".save-layout .wrong")).to_contain_text("Use up to 60 letters")
+    page.get_by_label("Name of the layout").fill(name)
+    page.get_by_role("button", name="Save", exact=True).click()
+    expect(page).to_have_url(re.compile(rf"\?layout={name}$"))
+    expected = {"pins": [f"{name}.y"], "plots": {f"{name}.y": {"log": True}}, "overlays": {}, "busiest": True}
+    assert kvs["_layouts"][name].read() == expected
+    kvs["_layouts"]["hostile"].write({"pins": {"x": 1}, "plots": [1], "overlays": 3, "busiest": "x"})
+    kvs["_layouts"]["array"].write({"pins": np.zeros(3)})
+
+    other = visit.open(f"/?layout={name}")
+    expect(other.locator(".pane .pane-head a")).to_have_text([f"{name}.y"])
+    expect(other.get_by_role("button", name="Logarithmic axis")).to_have_attribute("aria-pressed", "true")
+    other.locator(".pin").click()
+    expect(other.get_by_label("Layout", exact=True).locator("option:checked")).to_have_text(f"{name} (changed)")
+    other.get_by_label("Layout", exact=True).select_option("saved hostile")
+    expect(other.locator(".pane")).to_have_count(0)
+    other.get_by_label("Layout", exact=True).select_option("own")
+    assert (
+        other.evaluate("localStorage.getItem('reem:layout:' + JSON.parse(document.body.dataset.config).title)") is None
+    )
+    link = "#layout=" + quote(json.dumps(expected | {"busiest": False}))
+    linked = visit.open("/" + link)
+    expect(linked.locator(".pane .pane-head a")).to_have_text([f"{name}.y"])
+    expect(linked.get_by_label("busiest keys")).not_to_be_checked()
+
+    page.get_by_role("button", name="Save…").click()
+    page.get_by_role("button", name="Remove", exact=True).click()
+    expect(page.locator("#toast")).to_have_text("Removed from the store")
+    assert name not in kvs["_layouts"].read()
+    kvs["_layouts"].delete()
 
 
 def test_the_first_page_lists_services(visit, kvs, key):

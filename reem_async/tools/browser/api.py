@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import re
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
@@ -24,7 +25,7 @@ from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import walk
 from ..jsontext import json_text
-from .source import Node, NotKept, Series, Source, address, path_of, silences, thinned, visible
+from .source import LAYOUTS, Node, NotKept, Series, Source, address, path_of, silences, thinned, visible
 from .trees import CONTENTS
 
 # Requests: parameters are checked, and errors become answers with the right status.
@@ -160,6 +161,9 @@ _MOST_LOSSES = 500
 _MOST_FOUND = 60
 _LONGEST_TEXT = 200_000
 _MOST_PARAMETERS = 200
+_MOST_LAYOUTS = 100
+_LARGEST_LAYOUT = 1 << 15  # bytes
+_LAYOUT_NAME = re.compile(r"\w[\w -]{0,59}")
 _MOST_SERVERS = 200  # of services that the first page lists
 
 
@@ -173,11 +177,14 @@ class Api:
         self.key = secrets.token_urlsafe(24)
 
     def routes(self) -> list[Route]:
-        asked = self.tree, self.series, self.activity, self.search, self.parameters, self.services
+        asked = self.tree, self.series, self.activity, self.search, self.parameters, self.services, self.layouts
         routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         routes.append(Route("/node", told(self.node), methods=["GET"]))
         routes.append(Route("/json", answered(self.json), methods=["GET"]))
-        return [*routes, *(Route(f"/{it.__name__}", answered(it), methods=["POST"]) for it in (self.write, self.hint))]
+        return [
+            *routes,
+            *(Route(f"/{it.__name__}", answered(it), methods=["POST"]) for it in (self.write, self.hint, self.layout)),
+        ]
 
     async def tree(self, request: Request) -> Response:
         """Return the items of all open branches, what changed since an instant marked."""
@@ -226,7 +233,7 @@ class Api:
         """Return a value as JSON, for the editor; raises BadType if arrays or bytes are in it."""
         path = value_path_in(request)
         value = (await self._source.value(path, at_of(request))).value
-        if any(isinstance(it, (Unfetched, *CONTENTS)) for _, it in walk(value, path)):
+        if not _is_plain(value):
             raise BadType(f"{show(path)} holds arrays or bytes, which a page cannot write; edit what is below it")
         text = json_text(value, pretty=True).encode(errors="backslashreplace")  # half of a surrogate pair
         return Response(text, media_type="application/json")
@@ -274,6 +281,29 @@ class Api:
         await self._source.write(path, value)
         return reply({"written": address(path)})
 
+    async def layouts(self, request: Request) -> Response:
+        """Return the layouts in the store, by their names."""
+        try:
+            found = (await self._source.value((LAYOUTS,), None)).value
+        except (MissingKey, NotKept, BadData, errors.NotAllowed):
+            found = {}
+        items = list(found.items())[:_MOST_LAYOUTS] if isinstance(found, dict) else []
+        layouts = {name: it for name, it in items if isinstance(it, dict) and _is_plain(it)}
+        # Not by orjson: programs may have stored half of a surrogate pair.
+        return Response(json.dumps({"layouts": layouts}), media_type="application/json")
+
+    async def layout(self, request: Request) -> Response:
+        """Keep a layout in the store, or remove it with null."""
+        if not self.allow_write:
+            raise RefusedRequest(403, "this page is read-only; start it with: reem browse --allow-write")
+        name, layout = await self._content(request)
+        if _LAYOUT_NAME.fullmatch(name) is None:
+            raise RefusedRequest(400, f"{name[:60]!r} names no layout; use up to 60 letters, digits, blanks, - and _")
+        if layout is not None and (not isinstance(layout, dict) or len(json.dumps(layout)) > _LARGEST_LAYOUT):
+            raise RefusedRequest(400, f"a layout is an object of up to {_LARGEST_LAYOUT} bytes")
+        await self._source.save_layout(name, layout)
+        return reply({"saved": name})
+
     async def hint(self, request: Request) -> Response:
         """Note what the bytes of another program are, for this start of the page; nothing is written."""
         path, text = await self._asked_by_own_page(request)
@@ -284,6 +314,13 @@ class Api:
 
     async def _asked_by_own_page(self, request: Request) -> tuple[Path, Any]:
         """Return the path and the value that a page from here sends."""
+        where, value = await self._content(request)
+        path = path_of(where)
+        if not path:
+            raise RefusedRequest(400, "a top-level key is needed")
+        return path, value
+
+    async def _content(self, request: Request) -> tuple[str, Any]:
         if not same_origin(request.headers):
             raise RefusedRequest(403, "this did not come from a page of this program")
         offered = request.headers.get("x-reem-key", "")
@@ -293,10 +330,7 @@ class Api:
         content = await body_of(request)
         if not isinstance(content, dict) or "value" not in content or not isinstance(content.get("path"), str):
             raise RefusedRequest(400, 'send {"path": ..., "value": ...}')
-        path = path_of(content["path"])
-        if not path:
-            raise RefusedRequest(400, "a top-level key is needed")
-        return path, content["value"]
+        return content["path"], content["value"]
 
 
 def _control(it: StoredParameter) -> dict[str, Any]:
@@ -316,6 +350,10 @@ def _control(it: StoredParameter) -> dict[str, Any]:
         "default_text": visible(_value_text(specification.default)),
         "invalid": visible(it.invalid),
     }
+
+
+def _is_plain(value: Any) -> bool:
+    return not any(isinstance(it, (Unfetched, *CONTENTS)) for _, it in walk(value, ()))
 
 
 def _value_text(value: Any) -> str:

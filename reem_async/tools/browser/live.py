@@ -22,7 +22,21 @@ from .follower import Follower
 from .history import History
 from .partial_reads import keys_at, peek
 from .raw import RawFollower
-from .source import Loss, Node, NotKept, Page, Sample, Series, Status, counted, matching, node_of, numbers_in, snippets
+from .source import (
+    LAYOUTS,
+    Loss,
+    Node,
+    NotKept,
+    Page,
+    Sample,
+    Series,
+    Status,
+    counted,
+    matching,
+    node_of,
+    numbers_in,
+    snippets,
+)
 from .timeline import UNKNOWN
 from .trees import Frame, differing, thawed
 
@@ -238,6 +252,12 @@ class LiveSource:
             return await statistics(self.interface.session)
         except NotAllowed:  # the page shows all the rest
             return []
+
+    async def save_layout(self, name: str, layout: dict[str, Any] | None) -> None:
+        if layout is None:
+            await self._space[LAYOUTS][name].delete()
+        else:
+            await publish(self.interface.session, (LAYOUTS, name), layout)
 
     async def write(self, path: Path, value: Any) -> None:
         """Publish a value in the place of a plain one; subscribers learn of it. Up to five round trips.

@@ -180,6 +180,9 @@ class LogSource(Source):
     async def write(self, path: Path, value: Any) -> None:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")
 
+    async def save_layout(self, name: str, layout: dict[str, Any] | None) -> None:
+        raise ReadOnly("a recording cannot be changed; share a layout by its link")
+
     def hint(self, path: Path, text: str) -> None:
         raise ReadOnly("what bytes are can be said on the page of a server, and not of a recording")
 

@@ -59,6 +59,8 @@ def snippets(path: Path, url: str, namespace: str, *, raw: bool = False) -> dict
     }
 
 
+LAYOUTS = "_layouts"  # the key of the layouts that pages saved, by their names
+
 # Nodes: what one line of the tree shows.
 
 LONGEST_TEXT = 200  # characters of a text that a line shows
@@ -236,6 +238,9 @@ class Source(Protocol):
     # What the servers of services say now, see `statistics` in coordination/calls.py.
     async def services(self) -> list[dict[str, Any]]:
         return []
+
+    # Keeps a layout of the page in the store; None removes it, and raises MissingKey if there is none.
+    async def save_layout(self, name: str, layout: dict[str, Any] | None) -> None: ...
 
     # Which paths were published or seen to change; which have another value at one instant than at another.
     async def changes(self, since: float, until: float, most: int) -> list[Path]: ...

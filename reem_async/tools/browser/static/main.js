@@ -1,6 +1,6 @@
 // The page: which path and which instant are shown, what keeps them up to date, and the keyboard.
 import { TimeAxis } from "./course.js";
-import { Layout } from "./layout.js";
+import { Layout, LayoutBar } from "./layout.js";
 import { STEP, TimeBar } from "./slider.js";
 import { makeSplitter } from "./splitter.js";
 import { Tree } from "./tree.js";
@@ -50,7 +50,8 @@ const app = {
   },
 
   url() {
-    return addressUrl(this.path) + (this.at === null ? "" : `?at=${this.at.toFixed(3)}`);
+    const query = [this.layouts.query, this.at === null ? "" : `at=${this.at.toFixed(3)}`].filter(Boolean).join("&");
+    return addressUrl(this.path) + (query && `?${query}`) + this.layouts.hash;
   },
 
   go(address, push = true) {
@@ -218,10 +219,11 @@ function decoded(text) {
   }
 }
 
-function route() {
+async function route() {
   const address = location.pathname.startsWith("/view/") ? decoded(location.pathname.slice(6)) : "";
   const at = Number(new URLSearchParams(location.search).get("at"));
   app.at = at ? Math.min(Math.max(at, app.span.start), app.span.end) : null;
+  await app.layouts.open(location);
   app.go(address, false);
 }
 
@@ -242,6 +244,7 @@ function onKey(event) {
 }
 
 app.axis = new TimeAxis(app);
+app.layouts = new LayoutBar(app);
 const time = new TimeBar(app);
 const tree = new Tree(document.getElementById("tree"), app, "", `reem:open:${config.title}`);
 const view = new View(document.getElementById("view"), app);
@@ -260,5 +263,4 @@ document.addEventListener("click", (event) => {
 document.addEventListener("keydown", onKey);
 document.addEventListener("visibilitychange", () => { app.heard = performance.now(); listen(); });
 window.addEventListener("popstate", route);
-route();
-listen();
+route().finally(listen);

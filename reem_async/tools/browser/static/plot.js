@@ -366,7 +366,7 @@ export class Plot {
       return { text, element, remove };
     });
     this.named.key = key;
-    this.legend.replaceChildren(...this.named.flatMap(({ element, remove }) => (remove ? [element, remove] : [element])));
+    this.legend.replaceChildren(...this.named.map(({ element, remove }) => (remove ? el("span", { class: "entry" }, element, remove) : element)));
   }
 
   toggle(name) {

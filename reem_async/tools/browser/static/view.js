@@ -1,14 +1,13 @@
 // The value: what is at the chosen path, drawn anew when its type changes and brought up to date when it does not.
 import { ArrayView } from "./arrays.js";
 import { Course } from "./course.js";
+import { Home } from "./home.js";
 import { isNumber, MOST, Panes } from "./panes.js";
 import { Parameters } from "./parameters.js";
 import { Tree } from "./tree.js";
 import { addressUrl, ageText, bodyOf, bytesText, copy, el, fetched, getJson, getPicture, nameOf, postWrite, query, setNumbers, setText, steps, swap, toast, visible } from "./util.js";
 
 const LONGEST = 16; // items of a list that are drawn over time
-const BUSY = 6, OF_EACH = 3, BUSY_PAUSE = 5000, SERVICES_PAUSE = 2000, FRESH = 10;
-// The keys on the first page, the panes of each, ms until others may take their place, s in which a number must have come.
 const SCALARS = ["str", "int", "float", "bool", "NoneType"];
 const NUMBERS = ["int", "float", "bool"];
 
@@ -227,76 +226,6 @@ class TextBody {
   update(node) {
     setText(this.text, node.full || " ");
     this.cut.hidden = !node.cut;
-  }
-}
-
-// What is on the first page: what was pinned, else the pictures and plots of the keys that are published most often.
-class Home {
-  constructor(parent, app) {
-    this.app = app;
-    this.title = el("h2", { class: "home-title" });
-    this.hint = el("div", { class: "empty" }, el("p", {}, "Choose a key to see its value."),
-      el("p", {}, el("kbd", {}, "/"), " searches, ", el("kbd", {}, "?"), " shows the keyboard."));
-    parent.append(this.title, this.hint);
-    this.panes = new Panes(parent, app);
-    this.services = new Services(parent, app);
-    this.panes.onPin = () => app.refresh();
-    this.busy = [];
-  }
-
-  async update(signal) {
-    const pins = this.app.layout.pins, nodes = pins.length ? await this.pinned(pins, signal) : await this.busiest(signal);
-    if (signal?.aborted) return;
-    setText(this.title, nodes.length ? (pins.length ? "Pinned" : "Busiest keys") : "");
-    this.hint.hidden = nodes.length > 0;
-    this.panes.picturesFirst = !pins.length; // pinned ones stay in the order that the visitor gave them
-    await this.panes.update(nodes, signal);
-    await this.services.update(signal);
-  }
-
-  async pinned(pins, signal) {
-    const results = await Promise.allSettled(pins.map((path) => getJson("node", { path, at: this.app.at }, signal)));
-    return results.filter(({ status }) => status === "fulfilled").map(({ value }) => value).filter((node) => node.kind !== "dict");
-  }
-
-  async busiest(signal) {
-    const { app } = this, now = performance.now();
-    if (!this.busy.length || now > this.chosen + BUSY_PAUSE) {
-      const [root] = (await getJson("tree", { at: app.at, open: ["500:0:"] }, signal)).branches;
-      this.chosen = now;
-      const busy = root.nodes.filter((node) => node.rate >= 0.5).sort((one, other) => other.rate - one.rate).slice(0, BUSY).map((node) => node.address);
-      this.busy = [...this.busy.filter((each) => busy.includes(each)), ...busy.filter((each) => !this.busy.includes(each))];
-    }
-    if (!this.busy.length) return [];
-    const open = ["500:0:", ...this.busy.map((address) => `50:0:${address}`)];
-    const { branches: [root, ...branches] } = await getJson("tree", { at: app.at, open }, signal);
-    const picked = this.busy.flatMap((address, index) => {
-      const own = root.nodes.filter((node) => node.address === address);
-      const below = [...own, ...branches[index].nodes].filter((node) => node.kind === "numpy" || app.now() - node.time < FRESH);
-      return this.panes.choose(below.sort((one, other) => (other.kind === "numpy") - (one.kind === "numpy"))).slice(0, OF_EACH);
-    });
-    return this.panes.choose(picked.sort((one, other) => (other.kind === "numpy") - (one.kind === "numpy")));
-  }
-}
-
-// On the first page, a line for each server of each service, as of now.
-class Services {
-  constructor(parent, app) {
-    this.app = app;
-    this.next = 0;
-    this.lines = el("tbody");
-    const heads = ["service", "host", "pid", "calls/s", "median", "errors"].map((text) => el("th", { scope: "col" }, text));
-    this.element = el("section", { class: "card services", hidden: true, "aria-label": "Services" }, el("table", {}, el("thead", {}, el("tr", {}, ...heads)), this.lines));
-    parent.append(this.element);
-  }
-
-  async update(signal) {
-    if (!this.app.config.live || performance.now() < this.next) return;
-    this.next = performance.now() + SERVICES_PAUSE;
-    const { services } = await getJson("services", {}, signal);
-    const cells = (it) => [it.service, it.host, it.pid, it.rate?.toFixed(1), it.median === null ? null : `${(it.median * 1000).toFixed(1)} ms`, it.errors];
-    this.lines.replaceChildren(...services.map((it) => el("tr", {}, ...cells(it).map((cell) => el("td", {}, `${cell ?? "-"}`)))));
-    this.element.hidden = !services.length;
   }
 }
 
