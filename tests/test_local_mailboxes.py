@@ -1,8 +1,8 @@
 """The sockets of early updates under forks, kill -9, Ctrl-C, full queues, limits, other users and hostile bytes."""
 
-import array
 import asyncio
 import contextlib
+import gc
 import os
 import resource
 import shutil
@@ -14,15 +14,21 @@ import sys
 import tempfile
 import threading
 
+import numpy as np
 import pytest
 from conftest import PATIENCE, ROOT, aeventually, eventually, line_of
+from slotkit import in_slot
+from test_local_memory import OPENED
 
 import reem
 import reem_async
 from reem_async.local import mailbox
+from reem_async.local import segment as local_segment
 from reem_async.local.mailbox import FOLLOWS, JOINED, PUBLISHER, SUBSCRIBER, UPDATE, Mailbox, Subscribers
 from reem_async.local.segment import host, reason_against
+from reem_async.plan import notices
 from reem_async.plan.keys import keys_of
+from reem_async.plan.notices import Slot
 from reem_async.pubsub.early import EarlyInbox
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
@@ -34,6 +40,9 @@ def folder(monkeypatch):
     monkeypatch.setattr(mailbox, "_PARENT", parent)
     yield f"{parent}/reem-{os.getuid()}"
     shutil.rmtree(parent)
+
+
+IMAGE = np.arange(30_000, dtype=np.float64)
 
 
 class Pair:
@@ -55,9 +64,9 @@ class Pair:
         await self.one.close()
         await self.other.close()
 
-    async def publish(self):
+    async def publish(self, **more):
         self.number += 1
-        await self.space.write({"n": self.number})
+        await self.space.write({"n": self.number, **more})
 
     async def go_round(self):
         """Publish an update, which arrives once and without a gap; return whether it was early."""
@@ -65,6 +74,14 @@ class Pair:
         update = await asyncio.wait_for(anext(self.updates), PATIENCE)
         assert (update.data, update.gap, update.missed) == ({"n": self.number}, False, 0)
         return update.early
+
+    async def pass_image(self):
+        """Publish an image; return whether it was early, and was looked at in its publisher's memory."""
+        image = IMAGE * self.number
+        await self.publish(image=image)
+        update = await asyncio.wait_for(anext(self.updates), PATIENCE)
+        assert np.array_equal(update.data["image"], image)
+        return update.early, in_slot(update.data["image"])
 
     @property
     def mailboxes(self):
@@ -253,6 +270,64 @@ async def test_a_program_that_is_stopped_costs_nothing_but_its_own_early_updates
         stopped.close()
 
 
+async def test_the_memory_of_an_early_publisher_arrives_with_its_updates(server_url, key, folder, monkeypatch):
+    """Where `/proc` does not show it. What was lost arrives with the next answer, within a second."""
+
+    def hidden(_):
+        raise PermissionError
+
+    before = descriptors()
+    async with Pair(server_url, key("cam")) as pair:
+        monkeypatch.setattr(local_segment, "_opened", hidden)
+        assert await pair.go_round()
+        assert await pair.pass_image() == (True, True)
+        pair.other.session.local.close()  # what it has looked at is unmapped
+        pair.other.session.local._off = False
+        assert (await pair.pass_image())[1] is False
+        pair.one.session.local._audiences.clear()
+        await pair.pass_image()
+        kept = [await pair.pass_image() for _ in range(3)]
+        assert kept[-1] == (True, True), kept
+    del pair  # has the last image
+    gc.collect()
+    assert descriptors() <= before
+
+
+CONTAINED = """
+import os, sys
+import reem
+from reem_async.local import mailbox
+from slotkit import in_slot
+
+mailbox._PARENT, url, key = sys.argv[1:4]
+with reem.SilentSubscriber(key, reem.RedisInterface(url)).watch(reem.Last(1000)) as updates:
+    print("ready", os.getpid(), flush=True)
+    for update in updates:
+        if update.early:
+            print(in_slot(update.data["image"]), flush=True)
+"""
+
+
+@pytest.mark.skipif(
+    subprocess.run(["unshare", "--pid", "--fork", "--mount-proc", "true"], capture_output=True, check=False).returncode
+    != 0,
+    reason="processes cannot have numbers of their own here",
+)
+async def test_a_container_that_shares_the_folder_is_notified_early_and_looks_into_the_memory(server_url, key, folder):
+    async with Pair(server_url, key("cam")) as pair:
+        command = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child", sys.executable, "-c", CONTAINED]
+        words = os.path.dirname(folder), server_url, key("cam")
+        with subprocess.Popen(
+            [*command, *words], stdout=subprocess.PIPE, cwd=ROOT, env={**os.environ, "PYTHONPATH": f"{ROOT}/tests"}
+        ) as process:
+            assert line_of(process.stdout.fileno()).split() == ["ready", "1"]
+            reported = asyncio.create_task(asyncio.to_thread(line_of, process.stdout.fileno()))
+            while not reported.done():
+                await pair.pass_image()
+            process.kill()
+        assert reported.result().strip() == "True"
+
+
 async def test_without_a_descriptor_updates_arrive_through_the_server(server_url, key, folder):
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     async with Pair(server_url, key("cam")) as pair:
@@ -335,17 +410,39 @@ async def test_hostile_datagrams_change_nothing(server_url, key, folder):
         before = descriptors()
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, open("/dev/null", "rb") as file:
             for each in pair.mailboxes:
+                sender.connect(f"{folder}/{each.address}")
                 for number, content in enumerate(hostile(pair.channel).values()):
-                    passed = array.array("i", [file.fileno()] * number)
                     with contextlib.suppress(BlockingIOError):
-                        sender.sendmsg(
-                            [content],
-                            [(socket.SOL_SOCKET, socket.SCM_RIGHTS, passed)] if passed else [],
-                            socket.MSG_DONTWAIT,
-                            f"{folder}/{each.address}",
-                        )
+                        socket.send_fds(sender, [content], [file.fileno()] * number, socket.MSG_DONTWAIT)
                     assert await pair.go_round()
         await aeventually(lambda: descriptors() == before)
         assert pair.one.session.local.subscribers._known.keys() == {pair.channel}
         for _ in range(3):
             assert await pair.go_round()
+
+
+async def test_forged_descriptors_are_closed(server_url, key, folder, tmp_path, monkeypatch):
+    """Each is named as the memory of an update, alone or twenty times over. Segments are mapped for a while."""
+    monkeypatch.setattr(local_segment, "_IDLE", 0.0)
+    async with Pair(server_url, key("cam")) as pair:
+        assert await pair.pass_image() == (True, True)
+        address, follower = pair.mailboxes[1].address, pair.updates._link.follower
+        head = struct.pack("!cH", UPDATE, len(pair.channel)) + pair.channel
+        forged = [make(tmp_path) for make in OPENED.values()]
+        before = descriptors()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.connect(f"{folder}/{address}")
+            for number in range(1000):
+                descriptor = forged[number % len(forged)]
+                slot = Slot(host(), os.getpid(), 10**6, os.fstat(descriptor).st_ino, 0, 7)
+                notice = notices.in_slot(f"evil{number}", 1, 1.0, (), slot, b"1", [])
+                numbers = [descriptor] * (20 if number % 3 == 2 else 1)
+                socket.send_fds(sender, [head + notice], numbers, socket.MSG_DONTWAIT)
+                await asyncio.sleep(0.001 if number % 5 == 4 else 0)  # the queue has room for 10
+        await aeventually(lambda: descriptors() <= before)
+        for descriptor in forged:
+            os.close(descriptor)
+        assert follower.value()["n"] == pair.number
+        pair.one.session.local._audiences.clear()  # so that the publisher asks now, not within a second
+        await pair.pass_image()
+        assert await pair.pass_image() == (True, True)

@@ -111,6 +111,10 @@ class Descriptor:
         self.number = number
         self._file = self._now()
 
+    @property
+    def inode(self) -> int:
+        return self._file[1]
+
     def _now(self) -> tuple[int, int]:
         found = os.fstat(self.number)
         return found.st_dev, found.st_ino

@@ -23,12 +23,13 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..concurrency.locks import Descriptor
 from ..errors import BadValue
 from ..plan.keys import Keys
 from ..plan.notices import Slot, starts
 
 if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
-    from .mailbox import Subscribers
+    from .mailbox import Subscribers, hosts
     from .segment import HEAD, SLOTS, LocalReader, Segment, host
 
 
@@ -71,12 +72,15 @@ class LocalPath:
             return ""
         return host()
 
-    def channel(self, keys: Keys) -> str:
-        return f"{keys.channel}@{self.host}"
+    def channels(self, keys: Keys) -> list[str]:
+        """Return the channels of the subscribers near by; early, other containers that share the mailboxes are near."""
+        own = self.host
+        return [f"{keys.channel}@{each}" for each in (own, *(hosts() - {own} if self.early else ()))]
 
-    def view(self, slot: Slot, size: int) -> memoryview | None:
+    def view(self, slot: Slot, size: int, passed: Descriptor | None = None) -> memoryview | None:
         """Return the first bytes of a slot, so many, read-only; None if they are not to be had, or not near by."""
-        return self.reader.view(slot, size) if slot.host == self.host else None
+        host = self.host
+        return self.reader.view(slot, size, passed, is_near=slot.host == host) if host else None
 
     @functools.cached_property
     def subscribers(self) -> Subscribers:
@@ -91,11 +95,12 @@ class LocalPath:
         _, until = self._audiences.get(keys.channel, (0, 0.0))
         return time.monotonic() > until
 
-    def answered(self, keys: Keys, count: object) -> int:
+    def answered(self, keys: Keys, *counts: object) -> int:
         """Note how many near by listen; anything but a number says that it cannot be known. Returns how many did."""
         was = self.audience(keys)
         self._give_up(before=time.monotonic() - _IDLE)  # once a second is enough
-        holds, number = (_ASKED, count) if type(count) is int else (_REFUSED, 0)
+        numbers = [each for each in counts if type(each) is int]
+        holds, number = (_ASKED, sum(numbers)) if len(numbers) == len(counts) else (_REFUSED, 0)
         self._audiences[keys.channel] = number, time.monotonic() + holds
         while len(self._audiences) > _KEYS:
             self._audiences.popitem(last=False)
@@ -114,6 +119,11 @@ class LocalPath:
         if segment is None or written is None:
             return None
         return Slot(self.host, self._pid, segment.descriptor, segment.inode, *written)
+
+    def notify(self, keys: Keys, notice: bytes, *, is_in_slot: bool) -> None:
+        """Send an update to the subscribers near by."""
+        segment = self._segments.get(keys.channel) if is_in_slot else None
+        self.subscribers.notify(keys.channel.encode(), notice, segment.memory if segment else None)
 
     def _segment(self, channel: str, room: int) -> Segment | None:
         """Return the segment of a key with so many bytes in each slot, made if need be; None if that is too much.

@@ -8,7 +8,8 @@ A mailbox is a Unix socket in a folder that only the user can enter, and the ker
     subscriber -- FOLLOWS channel address ---------> that publisher
     publisher  -- UPDATE channel notice -----------> those subscribers
 
-What is lost here, or arrives late, arrives through the server as well.
+The first update in a segment, and then one a second, carries the descriptor of that memory, so that a subscriber need
+not find it in `/proc`. What is lost here, or arrives late, arrives through the server as well.
 """
 
 from __future__ import annotations
@@ -38,20 +39,25 @@ _LARGEST = 1 << 17  # bytes of a datagram: twice the largest value that is not i
 _ANSWER = 1 << 11  # bytes of a datagram for a publisher: the name of a channel and an address
 _HEAD = struct.Struct("!cH")  # the kind, and the bytes of the channel
 _CREDENTIALS = struct.Struct("3i")  # struct ucred of <sys/socket.h>: process, user, group
-_ANCILLARY = socket.CMSG_SPACE(_CREDENTIALS.size)  # no room for descriptors: the kernel closes them
+_DESCRIPTOR = struct.Struct("i")
+_ANCILLARY = socket.CMSG_SPACE(_CREDENTIALS.size) + socket.CMSG_LEN(_DESCRIPTOR.size)
+"""Room for the user and one descriptor: the kernel closes further ones, and says that something is missing."""
 _ADDRESS = re.compile(r"[0-9a-f]{16}[ps][0-9a-f]{16}")
+_HOST = 16  # characters of an address that name its host
 _PARENT = "/tmp"  # noqa: S108 - the owner of what is below is checked
 _ANSWERED = 2.5  # seconds for which the answer of a subscriber holds: publishers ask each second
 _CHANNELS = 1000  # of one publisher, whose subscribers are remembered
 _SUBSCRIBERS = 256  # of one channel that are notified early
 _INVALID = 100  # datagrams that are skipped at a time
-_TRUNCATED = int(socket.MSG_TRUNC)  # an int: Python computes with flags of an enum ten times slower
+_CLOSE_ON_EXEC = int(socket.MSG_CMSG_CLOEXEC)  # an int: Python computes with flags of an enum ten times slower
+_TRUNCATED = int(socket.MSG_TRUNC | socket.MSG_CTRUNC)
 
 
 class Datagram(NamedTuple):
     kind: bytes
     channel: bytes
     content: bytes
+    memory: Descriptor | None = None  # of a segment, or of anything: the receiver has to check it
 
 
 class Mailbox:
@@ -89,14 +95,20 @@ class Mailbox:
         """Whether others can find it: it is open, and its file was not removed, as when a program empties /tmp."""
         return self.close.alive and os.path.exists(f"{self._folder}/{self.address}")
 
-    def try_send(self, address: str, kind: bytes, channel: bytes, content: bytes = b"") -> None:
+    def try_send(
+        self, address: str, kind: bytes, channel: bytes, content: bytes = b"", memory: Descriptor | None = None
+    ) -> None:
         """Send without waiting; raises OSError, which is a BlockingIOError if the receiver's queue is full."""
-        self._socket.sendto(_HEAD.pack(kind, len(channel)) + channel + content, f"{self._folder}/{address}")
+        passed = [] if memory is None or not memory.is_own else [_DESCRIPTOR.pack(memory.number)]
+        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, each) for each in passed]
+        self._socket.sendmsg([_HEAD.pack(kind, len(channel)), channel, content], rights, 0, f"{self._folder}/{address}")
 
-    def send(self, address: str, kind: bytes, channel: bytes, content: bytes = b"") -> bool:
+    def send(
+        self, address: str, kind: bytes, channel: bytes, content: bytes = b"", memory: Descriptor | None = None
+    ) -> bool:
         """Send without waiting; return False if that address does not exist any more."""
         try:
-            self.try_send(address, kind, channel, content)
+            self.try_send(address, kind, channel, content, memory)
         except (ConnectionRefusedError, FileNotFoundError):
             return False
         except OSError:  # its queue is full, this mailbox is closed, or the system has no memory for it now
@@ -108,16 +120,27 @@ class Mailbox:
         buffer = bytearray(_ANSWER) if self._buffer is None else self._buffer  # threads share a publisher's
         for _ in range(_INVALID):
             try:
-                size, ancillary, flags, _ = self._socket.recvmsg_into([buffer], _ANCILLARY)
+                size, ancillary, flags, _ = self._socket.recvmsg_into([buffer], _ANCILLARY, _CLOSE_ON_EXEC)
             except OSError:
                 return None
+            memory = _received(ancillary)  # closed unless it is returned
             users = [_CREDENTIALS.unpack(data)[1] for _, kind, data in ancillary if kind == socket.SCM_CREDENTIALS]
             if users == [os.getuid()] and size >= _HEAD.size and not flags & _TRUNCATED:
                 kind, length = _HEAD.unpack_from(buffer)
                 end = _HEAD.size + length
                 if end <= size:
-                    return Datagram(kind, bytes(buffer[_HEAD.size : end]), bytes(memoryview(buffer)[end:size]))
+                    return Datagram(kind, bytes(buffer[_HEAD.size : end]), bytes(memoryview(buffer)[end:size]), memory)
         return None
+
+
+def _received(ancillary: list[tuple[int, int, bytes]]) -> Descriptor | None:
+    for number in [_DESCRIPTOR.unpack(data)[0] for _, kind, data in ancillary if kind == socket.SCM_RIGHTS and data]:
+        try:
+            return Descriptor(number)
+        except OSError:  # of a file system that is gone
+            with contextlib.suppress(OSError):
+                os.close(number)
+    return None
 
 
 _all = Inherited[Mailbox](lambda mailbox: mailbox.close())
@@ -160,12 +183,25 @@ def _remove_dead(folder: str) -> None:
                 pass
 
 
-def publishers() -> list[str]:
-    beginning = host() + PUBLISHER
+def _addresses() -> list[str]:
     try:
-        return [name for name in os.listdir(_path()) if name.startswith(beginning) and is_address(name)]
+        return [name for name in os.listdir(_path()) if is_address(name)]
     except OSError:  # there has been no early publisher, or the folder is another user's
         return []
+
+
+def publishers() -> list[str]:
+    return [name for name in _addresses() if name[_HOST:].startswith(PUBLISHER)]
+
+
+def hosts() -> set[str]:
+    """Return the hosts that have mailboxes here: containers may share the folder, though each is a host by itself."""
+    return {name[:_HOST] for name in _addresses()}
+
+
+def mounted() -> bool:
+    """Return whether the folder is mounted, as in a container that shares it."""
+    return os.path.ismount(_path())
 
 
 def is_address(text: str) -> bool:
@@ -178,8 +214,9 @@ class Subscribers:
     def __init__(self) -> None:
         self._mailbox: Mailbox | None = None
         self._reported = ""  # the last warning
-        # By channel, in the order in which they were first asked for: until when the answer of each address holds
-        self._known: collections.OrderedDict[bytes, dict[str, float]] = collections.OrderedDict()
+        # By channel, in the order in which they were first asked for: until when the answer of each address holds, and
+        # the inode of the segment that was passed to it since
+        self._known: collections.OrderedDict[bytes, dict[str, tuple[float, int]]] = collections.OrderedDict()
 
     def ask(self, channel: bytes) -> bytes:
         """Return the address at which the subscribers of a channel are to answer; empty if there is none now."""
@@ -205,7 +242,7 @@ class Subscribers:
             if it.kind == JOINED:
                 joined.append(it.channel)
             elif it.kind == FOLLOWS and known is not None and is_address(address):
-                known[address] = time.monotonic() + _ANSWERED
+                known[address] = time.monotonic() + _ANSWERED, 0
                 if len(known) > _SUBSCRIBERS:
                     del known[address]
         return joined
@@ -213,13 +250,17 @@ class Subscribers:
     def count(self, channel: bytes) -> int:
         return len(self._known.get(channel, ()))
 
-    def notify(self, channel: bytes, notice: bytes) -> None:
+    def notify(self, channel: bytes, notice: bytes, memory: Descriptor | None) -> None:
+        """Send an update to the subscribers of a channel; `memory` is that of the segment it is in, if any."""
         known, mailbox, now = self._known.get(channel, {}), self._mailbox, time.monotonic()
         if mailbox is None or len(notice) > _LARGEST - _HEAD.size - len(channel):
             return
-        for address, until in [*known.items()]:
-            if until < now or not mailbox.send(address, UPDATE, channel, notice):
+        for address, (until, passed) in [*known.items()]:
+            new = None if memory is None or memory.inode == passed else memory
+            if until < now or not mailbox.send(address, UPDATE, channel, notice, new):
                 known.pop(address, None)
+            elif new is not None:
+                known[address] = until, new.inode
         # Where cores are few, a subscriber that was just woken goes first: the server can wait (a sixth of the time).
         os.sched_yield()
 

@@ -111,7 +111,7 @@ class Segment:
         # By which other processes reach it
         self.descriptor = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         # Closed with the last reference: another thread may be writing when the interface is closed.
-        self._owner = Descriptor(self.descriptor)
+        self.memory = Descriptor(self.descriptor)
         os.fchmod(self.descriptor, 0o600)
         # All of it now: where memory is short this fails, and no write later is met by SIGBUS. (A cgroup's limit may
         # still end the program, as it may wherever a program takes memory.)
@@ -123,7 +123,7 @@ class Segment:
             for start in range(0, self.shape.size, _STEP):
                 self._map.madvise(_POPULATE_WRITE, start, min(_STEP, self.shape.size - start))
         fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, SEALS | fcntl.F_SEAL_SEAL)
-        self.inode = os.fstat(self.descriptor).st_ino
+        self.inode = self.memory.inode
         IDENTITY.pack_into(self._map, 0, MARK, *self.shape)
         self._bytes = np.frombuffer(self._map, np.uint8)
 
@@ -190,13 +190,12 @@ class _Pin(NamedTuple):
 
 
 class _Mapping:
-    def __init__(self, slot: Slot) -> None:
+    def __init__(self, memory: Descriptor) -> None:
         self.pins: list[_Pin] = []
         self.used = 0.0
-        self._descriptor = _opened(slot)
-        self._owner = Descriptor(self._descriptor)
-        self._shape = _checked(self._descriptor, slot)
-        self._map = mmap.mmap(self._descriptor, self._shape.size, prot=mmap.PROT_READ)
+        self._memory = memory
+        self._shape = _checked(memory.number)
+        self._map = mmap.mmap(memory.number, self._shape.size, prot=mmap.PROT_READ)
 
     def view(self, slot: Slot, size: int) -> memoryview | None:
         """Return a view of the first `size` bytes of a slot; None if it does not hold any more what is meant."""
@@ -223,13 +222,13 @@ class _Mapping:
     def _locked(self, number: int) -> mmap.mmap | None:
         """Return what has a slot locked for reading as long as it lives; None if the slot is being written."""
         # Its own description, so that its lock goes with it and with nothing else.
-        with io.FileIO(f"/proc/self/fd/{self._descriptor}") as file:
+        with io.FileIO(f"/proc/self/fd/{self._memory.number}") as file:
             # A mapping has it open, too, and gives it back without any code of ours. It is not looked into.
             lock = mmap.mmap(file.fileno(), mmap.PAGESIZE, prot=mmap.PROT_READ)
             return lock if lock_for_reading(file.fileno(), number) else None
 
 
-def _opened(slot: Slot) -> int:
+def _opened(slot: Slot) -> Descriptor:
     """Open the memory of another process, if it is what is meant; nothing is opened that could block or act."""
     name = f"/proc/{slot.process}/fd/{slot.descriptor}"
     if os.readlink(name) != f"/memfd:{NAME} (deleted)":  # a file's server may hang when it is asked anything
@@ -237,14 +236,14 @@ def _opened(slot: Slot) -> int:
     path = os.open(name, os.O_PATH | os.O_CLOEXEC)
     try:
         found = os.fstat(path)
-        if not stat.S_ISREG(found.st_mode) or found.st_ino != slot.inode or found.st_uid != os.geteuid():
+        if not stat.S_ISREG(found.st_mode) or found.st_ino != slot.inode:
             raise ValueError("it is another file")
-        return os.open(f"/proc/self/fd/{path}", os.O_RDONLY | os.O_CLOEXEC)
+        return Descriptor(os.open(f"/proc/self/fd/{path}", os.O_RDONLY | os.O_CLOEXEC))
     finally:
         os.close(path)
 
 
-def _checked(descriptor: int, slot: Slot) -> Shape:
+def _checked(descriptor: int) -> Shape:
     """Return how a segment is divided; raises ValueError or OSError if it is none, or if it could still be altered."""
     if fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & SEALS != SEALS:
         raise ValueError("it is not sealed")
@@ -253,8 +252,8 @@ def _checked(descriptor: int, slot: Slot) -> Shape:
     found = os.fstat(descriptor)
     if mark != MARK or not 0 < slots <= _MOST_SLOTS or found.st_size != shape.size or shape.size > _LARGEST:
         raise ValueError("it is no segment")
-    if found.st_ino != slot.inode:
-        raise ValueError("it is another file")
+    if found.st_uid != os.geteuid():
+        raise ValueError("it is another user's")
     # Publishers take all memory of a segment at once. Of one that has none yet a few bytes may say that a text has
     # gigabytes, and to copy it would take these from us. The seals keep it from being given back later.
     if found.st_blocks * _BLOCK < found.st_size:
@@ -266,18 +265,30 @@ class LocalReader:
     """The segments that a subscriber looks into, mapped when first needed."""
 
     def __init__(self) -> None:
-        self._mappings: collections.OrderedDict[tuple[int, int, int], _Mapping] = collections.OrderedDict()
+        self._mappings: collections.OrderedDict[tuple[int, int, int, str], _Mapping] = collections.OrderedDict()
 
-    def view(self, slot: Slot, size: int) -> memoryview | None:
+    def view(
+        self, slot: Slot, size: int, passed: Descriptor | None = None, *, is_near: bool = True
+    ) -> memoryview | None:
         """Return the first `size` bytes of a slot, read-only; None if they are not to be had (any more).
 
         The slot is not written while anything refers to the view, which may be a copy.
+
+        Args:
+            slot: Where it is.
+            size: Bytes.
+            passed: The descriptor that has arrived with the notice, if any.
+            is_near: Otherwise it can be found in `/proc`.
         """
-        place = slot.process, slot.descriptor, slot.inode
+        place = slot.process, slot.descriptor, slot.inode, slot.host
         try:
             mapping = self._mappings.get(place)
             if mapping is None:
-                mapping = self._mappings[place] = _Mapping(slot)
+                if passed is None or passed.inode != slot.inode:
+                    if not is_near:
+                        return None
+                    passed = _opened(slot)
+                mapping = self._mappings[place] = _Mapping(passed)
                 while len(self._mappings) > _MAPPINGS:
                     self._mappings.popitem(last=False)
             self._mappings.move_to_end(place)

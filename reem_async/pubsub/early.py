@@ -7,8 +7,10 @@ import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from ..concurrency.locks import Descriptor
+
 if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
-    from ..local.mailbox import FOLLOWS, JOINED, SUBSCRIBER, UPDATE, Datagram, Mailbox, is_address, publishers
+    from ..local.mailbox import FOLLOWS, JOINED, SUBSCRIBER, UPDATE, Datagram, Mailbox, is_address, mounted, publishers
 
 # The queue of a publisher often has room for 10 answers. It reads them when it publishes.
 _RETRY = 0.03  # seconds until an answer is sent once more
@@ -59,9 +61,9 @@ class LoopMailbox:
 class EarlyInbox(LoopMailbox):
     """The mailbox of the subscriptions of an event loop; opened when there is an early publisher on this host."""
 
-    def __init__(self, take: Callable[[bytes, bytes], None]) -> None:
+    def __init__(self, take: Callable[[bytes, bytes, Descriptor | None], None]) -> None:
         super().__init__(self._take_update, 100)
-        self._take = take  # called with the channel of an early update, and its notice
+        self._take = take  # called with the channel of an early update, its notice, and the memory of its publisher
 
     def _opened(self) -> Mailbox | None:
         if self._mailbox is not None and not self._mailbox.is_there:
@@ -71,7 +73,8 @@ class EarlyInbox(LoopMailbox):
     def joined(self, channel: bytes) -> None:
         """Notify the early publishers of this host of a new subscriber, so that they ask."""
         addresses = publishers()
-        mailbox = self._opened() if addresses else None
+        # A publisher of another container finds this one by its mailbox.
+        mailbox = self._opened() if addresses or mounted() else None
         if mailbox is not None:
             for address in addresses:
                 mailbox.send(address, JOINED, channel)
@@ -96,4 +99,4 @@ class EarlyInbox(LoopMailbox):
 
     def _take_update(self, it: Datagram) -> None:
         if it.kind == UPDATE:
-            self._take(it.channel, it.content)
+            self._take(it.channel, it.content, it.memory)

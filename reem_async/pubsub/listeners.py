@@ -15,7 +15,7 @@ from enum import Enum, auto
 from functools import partial
 from typing import Any, Concatenate, NamedTuple, ParamSpec
 
-from ..concurrency.locks import WeakList
+from ..concurrency.locks import Descriptor, WeakList
 from ..concurrency.queues import BoundedQueue
 from ..errors import BadData, ServerNotReady, is_of_command
 from ..local import LocalPath
@@ -158,6 +158,7 @@ class Inbox:
         self._transport = transport
         self._ships = ships
         self._topics = topics
+        self._local = local
         self._view = local.view if local.host else None
         # The end of the channels on which publishers of this host ask for subscribers; None if that is off
         self._asks = f"@{local.host}".encode() if local.host else None
@@ -222,13 +223,13 @@ class Inbox:
                 self._unreadable(channel, error)
                 listener.invalidate(channel)
 
-    def _take_early(self, channel: bytes, payload: bytes) -> None:
+    def _take_early(self, channel: bytes, payload: bytes, memory: Descriptor | None) -> None:
         topic: Any = (channel, False)
         listeners = [listener for listener in self._topics.get(topic, NO_LISTENERS).present() if listener.local]
         if not listeners:
             return
         try:
-            notice = decode(payload, self._ships, self._view)
+            notice = decode(payload, self._ships, partial(self._local.view, passed=memory))
             if notice.slot is None:  # none is kept from its publisher
                 self._early[payload] = notice
                 if len(self._early) > _MOST_EARLY:

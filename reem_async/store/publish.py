@@ -214,20 +214,21 @@ class ValueAnnouncement(UpdateAnnouncement):
         channel = keys.channel.encode()
         address = local.subscribers.ask(channel) if local.early else b""
         try:
-            (count,) = await session.transport.roundtrip([(keys.publish, local.channel(keys), address)])
+            asked: list[Command] = [(keys.publish, each, address) for each in local.channels(keys)]
+            counts = await session.transport.roundtrip(asked)
         except ConnectionLost as error:
             raise NotConnected(f"{error}; the update itself was not sent, so nothing was applied") from error
-        before = local.answered(keys, count)
+        before = local.answered(keys, *counts)
         # A new subscriber has to be notified early of this update. Those of older versions of REEM do not answer.
-        for _ in range(_ANSWERS if address and count != before else 0):
+        for _ in range(_ANSWERS if address and local.audience(keys) != before else 0):
             local.subscribers.take_answers()
             if local.subscribers.count(channel) >= local.audience(keys):
                 break
             await session.transport.pause(_ANSWER)
 
     def _notify_early(self, stamp: _Stamp, path: Path) -> bool:
-        channel, subscribers = self._keys.channel.encode(), self._session.local.subscribers
-        if not subscribers.count(channel):
+        local = self._session.local
+        if not local.subscribers.count(self._keys.channel.encode()):
             return False
         self._time = self._time or time.time()  # the update itself has the same, which identifies it
         if self._slot is None:
@@ -237,7 +238,7 @@ class ValueAnnouncement(UpdateAnnouncement):
             payload = self._payload(stamp, path)
         if len(payload) <= LARGEST_INLINE:
             self._early = stamp, payload
-        subscribers.notify(channel, payload)
+        local.notify(self._keys, payload, is_in_slot=self._slot is not None)
         return True
 
     def retract(self, path: Path) -> Sequence[Command]:
