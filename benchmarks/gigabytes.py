@@ -8,9 +8,15 @@
 """
 
 import argparse
+import contextlib
 import math
 import pathlib
+import random
 import resource
+import shutil
+import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -94,6 +100,111 @@ def library(file: pathlib.Path) -> None:
     print(f"{'largest memory of the process':48} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:8.0f} MB")
 
 
+@contextlib.contextmanager
+def _served(file: pathlib.Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """Run `reem browse --log`, as a user does; yields its address and the process."""
+    command = [
+        str(pathlib.Path(sys.executable).parent / "reem"),
+        "browse",
+        "--log",
+        str(file),
+        "--port",
+        "0",
+        "--no-open",
+    ]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        address = ""
+        while not address:
+            line = (program.stdout or sys.stdin).readline()
+            if not line:
+                raise SystemExit("reem browse ended")
+            address = next((word for word in line.split() if word.startswith("http://")), "")
+        yield address.rstrip("/"), program
+    finally:
+        program.terminate()
+        program.wait()
+
+
+def _memory(process: int) -> float:
+    """Return the MB of a process."""
+    text = pathlib.Path(f"/proc/{process}/status").read_text()
+    return int(text.partition("VmRSS:")[2].split()[0]) / 1024
+
+
+class _Actions:
+    """Does something on the page, and takes the time until the page has all that it asked for."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.took: dict[str, list[float]] = {}
+        self._waiting: set[Any] = set()
+        self._last = 0.0
+        for event in ("request", "requestfinished", "requestfailed"):
+            page.on(event, self._noted if event == "request" else self._answered)
+
+    def _noted(self, request: Any) -> None:
+        if "/api/" in request.url and "/api/events" not in request.url:
+            self._waiting.add(request)
+            self._last = time.perf_counter()
+
+    def _answered(self, request: Any) -> None:
+        if request in self._waiting:
+            self._waiting.discard(request)
+            self._last = time.perf_counter()
+
+    def do(self, what: str, work: Callable[[], Any]) -> None:
+        began = self._last = time.perf_counter()
+        work()
+        # Quiet for 0.1 s: nothing more is asked for.
+        while self._waiting or time.perf_counter() - self._last < 0.1:
+            self.page.wait_for_timeout(5)
+        self.took.setdefault(what, []).append(self._last - began)
+
+
+_SEEK = """part => {
+  const slider = document.getElementById("slider");
+  slider.value = part * slider.max;
+  slider.dispatchEvent(new Event("input", { bubbles: true }));
+}"""
+
+
+_GO = """there => {
+  history.pushState(null, "", there);
+  dispatchEvent(new PopStateEvent("popstate"));
+}"""
+
+
+def page(file: pathlib.Path, actions: int) -> None:
+    """Print what a page in Chromium takes: until there are keys, and for each of some actions of a visitor."""
+    from playwright.sync_api import sync_playwright
+
+    rng, began = random.Random(1), time.perf_counter()
+    with _served(file) as (address, program), sync_playwright() as driver:
+        print(f"{'reem browse --log answers':48} {time.perf_counter() - began:8.3f} s")
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--headless", "--no-sandbox"])
+        shown = browser.new_page(viewport={"width": 1200, "height": 800})
+        done, began = _Actions(shown), time.perf_counter()
+        shown.goto(address)
+        shown.locator("#tree .row").first.wait_for()
+        print(f"{'first keys':48} {time.perf_counter() - began:8.3f} s")
+        done.do("first page, wholly", lambda: None)
+        for number in range(actions):
+            path = PLOTTED[number % len(PLOTTED)]
+            if number % 5 == 0:
+                there = f"/view/{path}" if number % 10 == 0 else "/"
+                done.do("another view", lambda there=there: shown.evaluate(_GO, there))
+            else:
+                done.do("slider", lambda: shown.evaluate(_SEEK, rng.random()))
+        for what, took in done.took.items():
+            print(f"{what:48} {statistics.median(took):8.3f} s median of {len(took)}, {max(took):.3f} at most")
+        every = [each for what, took in done.took.items() if what != "first page, wholly" for each in took]
+        print(f"{'all actions':48} {statistics.median(every):8.3f} s median of {len(every)}, {max(every):.3f} at most")
+        used = shown.evaluate("() => performance.memory.usedJSHeapSize") / 1e6
+        print(f"{'memory: the program, the JavaScript of the page':48} {_memory(program.pid):8.0f} MB, {used:.0f} MB")
+        browser.close()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("write", "library", "page"))
@@ -105,6 +216,8 @@ def main() -> None:
         write(given.file, given.gigabytes * 1e9)
     elif given.what == "library":
         library(given.file)
+    else:
+        page(given.file, given.actions)
 
 
 if __name__ == "__main__":

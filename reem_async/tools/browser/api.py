@@ -188,6 +188,7 @@ class Api:
 
     async def tree(self, request: Request) -> Response:
         """Return the items of all open branches, what changed since an instant marked."""
+        await self._source.opened()
         at = at_of(request)
         marks = await self._marks(request, at)
         branches: list[dict[str, Any]] = []
@@ -239,6 +240,7 @@ class Api:
         return Response(text, media_type="application/json")
 
     async def series(self, request: Request) -> Response:
+        await self._source.opened()
         status = self._source.status()
         start, end = number_of(request, "start"), number_of(request, "end")
         start = status.start if start is None else start
@@ -249,6 +251,7 @@ class Api:
         return reply({"start": start, "end": end, **_thinned(found)._asdict(), **marks})
 
     async def activity(self, request: Request) -> Response:
+        await self._source.opened()
         status = self._source.status()
         bins = max(integer_of(request, "bins", 100, 400), 1)
         span, path = (status.start, status.end), path_in(request)
@@ -421,19 +424,19 @@ class Events:
         try:
             # Milliseconds until a browser that lost the connection tries again.
             yield b"retry: 1000\n\n"
-            told, quiet, before = self._source.status().end, 0.0, ""
+            told, quiet, before = self._source.status().end, 0.0, ("", 1.0)
             # Not all versions of uvicorn end the response of a page that has gone.
             while not self._ending() and not await request.is_disconnected():
                 status = self._source.status()
                 paths = await self._source.changes(told, status.end, _MOST_PATHS)
-                if paths or status.lost != before or quiet >= _QUIET:
+                if paths or (status.lost, status.part) != before or quiet >= _QUIET:
                     content = {
                         **status._asdict(),
                         "paths": [address(path) for path in paths],
                         "more": len(paths) >= _MOST_PATHS,
                     }
                     yield b"data: " + orjson.dumps(content) + b"\n\n"
-                    told, quiet, before = status.end, 0.0, status.lost
+                    told, quiet, before = status.end, 0.0, (status.lost, status.part)
                 await asyncio.sleep(_PAUSE)
                 quiet += _PAUSE
         finally:

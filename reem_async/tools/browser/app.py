@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
+import anyio
 import orjson
 import uvicorn
 from starlette.applications import Starlette
@@ -156,6 +157,34 @@ def _is_address(host: str) -> bool:
     return True
 
 
+class CancelledWithPage:
+    """Wraps the answers to what pages ask; cancels one for which no page waits any more, such as of a closed view."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "GET" or scope["path"].endswith("/events"):
+            await self._app(scope, receive, send)  # events go on until the page has gone
+            return
+
+        async def watch() -> None:
+            while (await receive())["type"] != "http.disconnect":
+                pass
+            tasks.cancel_scope.cancel()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(watch)
+            await self._app(scope, _nothing, send)
+            tasks.cancel_scope.cancel()
+
+
+async def _nothing() -> Message:
+    """Wait for a message that does not come: the request was read, and `CancelledWithPage` hears when its page goes."""
+    await anyio.sleep_forever()
+    return {"type": "http.disconnect"}
+
+
 # Running the application on a port.
 
 _GRACE_SECONDS = 2  # for requests that are being answered when the program ends
@@ -263,7 +292,7 @@ def create_app(
             Route("/", view, methods=["GET"]),
             Route("/view/{where:path}", view, methods=["GET"]),
             Mount("/static", StaticFiles(directory=_FOLDER / "static")),
-            Mount("/api", routes=routes),
+            Mount("/api", routes=routes, middleware=[] if source.live else [Middleware(CancelledWithPage)]),
         ]
     )
     app.user_middleware.append(Middleware(Guard, hosts=frozenset(hosts), addresses=any_address, token=token))

@@ -98,6 +98,9 @@ class LiveSource:
             min(max(self.history.start, end - self.history.seconds), end), end, self._follower.lost, "; ".join(notes)
         )
 
+    async def opened(self) -> None:
+        """Return: from when on there is a past is known from the beginning."""
+
     def shown_on(self, pages: int) -> None:
         self._follower.shown_on(pages)
         self._raw.shown_on(pages)

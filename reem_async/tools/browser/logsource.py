@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path as FilePath
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import anyio
+import anyio.from_thread
 import anyio.to_thread
 import numpy as np
 
@@ -16,9 +21,11 @@ from ...errors import MissingKey, ReadOnly
 from ...plan.paths import Path, parse, related, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import MISSING, get, mapped
+from ..recording.align import stacked
 from ..recording.log import ArrayHandle, Log, open_log
 from .source import (
     Loss,
+    MOST_LINES,
     Node,
     Page,
     Sample,
@@ -35,18 +42,27 @@ from .source import (
 from .trees import differing, strip
 
 Result = TypeVar("Result")
+Step = Callable[[int, int], None]
+"""Called with how much is read and how much there is; ends the reading when no page waits for it any more."""
 
-_CACHED = 8  # states, and lists of times, that are kept: neighbouring instants are asked for together
-# Values that are read to find out whether a path is worth drawing.
-_LOOKS = 6
+_CACHED = 8  # states that are kept: neighbouring instants are asked for together
+_COUNTED = 64  # paths of which the numbers of updates over time are kept
+_SERIES_BYTES = 64 << 20  # of the numbers over time that are kept, for a page that zooms
 _ROUNDING = 1e-6
 """Seconds: instants here are floats, those in the file nanoseconds; what happens at an instant belongs to it."""
+_AT_ONCE = 1.0  # seconds that opening may take before the page begins without it
+_PAUSE = 0.05  # seconds between two looks whether the file is open
+
+
+class _Closed(Exception):
+    """The page ends while the file is opened."""
 
 
 class LogSource(Source):
     """What a recording says that a server held.
 
-    Reading takes place in a thread, one at a time.
+    Reading takes place in threads: what takes a moment in one, what reads much of the file in another, one at a time
+    in each. A file that was not ended properly is read from record to record first. The page shows how far this is.
 
     Args:
         path: The file that `reem record` or another program wrote, or several that are shown as one.
@@ -61,29 +77,65 @@ class LogSource(Source):
     writable = False
 
     def __init__(self, path: str | FilePath | Sequence[FilePath], ships: Sequence[Any] | None = None) -> None:
-        self.log: Log = open_log(path, ships).raw  # pictures are shown as they are
-        more = len(self.log.files) - 1
-        self.title = self.log.path.name + (f" and {more} more" if more else "")
-        # When there was news of a path, sorted; read when it is asked for, since all of a long recording takes seconds.
-        self._times = lru_cache(_CACHED)(self.log.news_times)
+        files = [path] if isinstance(path, str | FilePath) else list(path)
+        self.title = FilePath(files[0]).name + (f" and {len(files) - 1} more" if files[1:] else "")
         self._state = lru_cache(_CACHED)(self._read_state)
-        self._gaps = lru_cache(1)(self.log.gaps)
-        self._turns = anyio.CapacityLimiter(1)
+        self._gaps = lru_cache(1)(lambda: self.log.gaps())
+        self._counts: OrderedDict[tuple[Path, int], list[int]] = OrderedDict()
+        self._series: OrderedDict[Path, _Columns] = OrderedDict()
+        self._quick, self._slow = anyio.CapacityLimiter(1), anyio.CapacityLimiter(1)
+        self._parts: dict[object, float] = {}  # how much is done of each reading that goes on
+        self._closing = False
+        self._opening: Future[Log] = Future()
+        threading.Thread(target=self._open, args=(files, ships), name="reem log", daemon=True).start()
+        with suppress(FutureTimeout):
+            self._opening.result(_AT_ONCE)
+
+    def _open(self, files: Sequence[str | FilePath], ships: Sequence[Any] | None) -> None:
+        def step(done: int, every: int) -> None:
+            self._parts[self] = done / max(every, 1)
+            if self._closing:
+                raise _Closed
+
+        try:
+            self._opening.set_result(open_log(files, ships, progress=step).raw)  # pictures are shown as they are
+        except BaseException as error:
+            self._opening.set_exception(error)
+        finally:
+            self._parts.pop(self, None)
+
+    @property
+    def log(self) -> Log:
+        return self._opening.result()
 
     async def start(self) -> None:
         """Nothing is to be done."""
 
+    async def opened(self) -> None:
+        """Wait until the file is open; raises what opening it has raised."""
+        while not self._opening.done():  # noqa: ASYNC110 - by a thread
+            await anyio.sleep(_PAUSE)
+        self._opening.result()
+
     async def close(self) -> None:
-        self.log.close()
+        self._closing = True
+        with suppress(ValueError, OSError, _Closed):  # what opening has raised
+            await self.opened()
+            self.log.close()
 
     def status(self) -> Status:
+        part = min([1.0, *self._parts.values()])
+        if not self._opening.done():
+            return Status(0, 0, part=part)
+        if self._opening.exception() is not None:
+            return Status(0, 0, str(self._opening.exception()))
         notes = [] if self.log.indexed else ["the recording was not ended properly"]
         if self.log.damaged:
             notes.append(f"{self.log.damaged} damaged records are skipped")
         if self.log.undecoded:
             notes.append(f"{len(self.log.undecoded)} topics are left out, see reem log info")
         start, end = (instant and instant + _ROUNDING for instant in (self.log.start, self.log.end))
-        return Status(start, end, "", "; ".join(notes))
+        return Status(start, end, "", "; ".join(notes), part)
 
     def shown_on(self, pages: int) -> None:
         """Do nothing: a recording is read only for a page."""
@@ -95,7 +147,22 @@ class LogSource(Source):
         return {"recording": f"{code}value = log[{path!r}].at({when})\ntimes, values = log[{path!r}].history()\n"}
 
     async def _do(self, work: Callable[[], Result]) -> Result:
-        return await anyio.to_thread.run_sync(work, limiter=self._turns)
+        await self.opened()
+        return await anyio.to_thread.run_sync(work, limiter=self._quick)
+
+    async def _read(self, work: Callable[[Step], Result]) -> Result:
+        """Return what `work` does, which may read much of the file; it ends soon after the request is cancelled."""
+        await self.opened()
+        reading = object()
+
+        def step(done: int, every: int) -> None:
+            anyio.from_thread.check_cancelled()
+            self._parts[reading] = done / max(every, 1)
+
+        try:
+            return await anyio.to_thread.run_sync(work, step, limiter=self._slow)
+        finally:
+            self._parts.pop(reading, None)
 
     def _read_state(self, at: float) -> dict[str, Any]:
         trees = self.log.tree_at(at)
@@ -137,6 +204,8 @@ class LogSource(Source):
         return Sample(await self._do(lambda: self.log.value_at(path, self._when(at))))
 
     async def changes(self, since: float, until: float, most: int) -> list[Path]:
+        if since >= until:  # as for the stream of events, which does not wait for what is read
+            return []
         return sorted(await self._do(lambda: self.log.changes(since, until)), key=show)[:most]
 
     async def differing(self, since: float, until: float, most: int) -> set[Path]:
@@ -148,22 +217,36 @@ class LogSource(Source):
         return differing(paths, lambda name: before.get(name, MISSING), lambda name: after.get(name, MISSING), most)
 
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
-        return await self._do(lambda: counted(self._times(path), start, end, bins))
+        return await self._read(lambda step: self._activity(start, end, bins, path, step))
+
+    def _activity(self, start: float, end: float, bins: int, path: Path, step: Step) -> list[int]:
+        if (path, bins) not in self._counts:
+            self._counts[path, bins] = counted(self.log.news_times(path, step), start, end, bins)
+            if len(self._counts) > _COUNTED:
+                self._counts.popitem(last=False)
+        self._counts.move_to_end((path, bins))
+        return self._counts[path, bins]
 
     async def series(self, path: Path, start: float, end: float) -> Series:
-        return await self._do(lambda: numbers_in(self._samples(path, start, end)))
+        return await self._read(lambda step: self._numbers(path, step).between(start, end))
 
-    def _samples(self, path: Path, start: float, end: float) -> Iterable[tuple[float, Any]]:
-        times = self._times(path)
-        places = np.linspace(0, len(times) - 1, min(len(times), _LOOKS)).astype(int)
-        news = [float(times[place]) - (place > 0) * _ROUNDING for place in places]
-        # Large arrays are not read for this. What was deleted at the end may have been numbers before.
-        found = [get(self._state(at), path) for at in {end, *news}]
-        if any(isinstance(it, bool | int | float | list) or is_small_vector(it) for it in found):
-            if start > self.log.start:  # what was there already
-                with suppress(MissingKey):
-                    yield start, self.log.value_at(path, start)
-            yield from self.log[path].values(start, end)
+    def _numbers(self, path: Path, step: Step) -> _Columns:
+        if path not in self._series:
+            at_end = get(self._state(self._when(None)), path)
+            # Large arrays are not read for this. What was deleted at the end may have been numbers before.
+            is_drawn = not isinstance(at_end, Unfetched | np.ndarray) or is_small_vector(at_end)
+            self._series[path] = _columns(self._outlines(path, step)) if is_drawn else _NONE
+            while sum([it.bytes for it in self._series.values()]) > _SERIES_BYTES and len(self._series) > 1:
+                self._series.popitem(last=False)
+        self._series.move_to_end(path)
+        return self._series[path]
+
+    def _outlines(self, path: Path, step: Step) -> Iterator[tuple[np.ndarray[Any, Any], list[Any]]]:
+        start, every = self.log.start, int(self.log.duration * 1e3)
+        for instants, values in self.log[path].outlines():
+            times = np.array(instants, np.int64).astype(np.float64) / 1e9
+            step(int((times[-1] - start) * 1e3), every)
+            yield times, values
 
     async def losses(self, path: Path, start: float, end: float) -> list[Loss]:
         return await self._do(lambda: list(self._losses(path, start, end)))
@@ -185,6 +268,54 @@ class LogSource(Source):
 
     def hint(self, path: Path, text: str) -> None:
         raise ReadOnly("what bytes are can be said on the page of a server, and not of a recording")
+
+
+class _Columns(NamedTuple):
+    """The numbers of a path over all of the recording: an instant for each row, and a column for each line."""
+
+    names: list[str]
+    times: np.ndarray[Any, Any]
+    rows: np.ndarray[Any, Any]  # NaN where there was no number
+
+    @property
+    def bytes(self) -> int:
+        return int(self.times.nbytes + self.rows.nbytes)
+
+    def between(self, start: float, end: float) -> Series:
+        """Return the part from what was there at the start on."""
+        first, last = np.searchsorted(self.times, [start, end + _ROUNDING])
+        times, rows = self.times[first:last], self.rows[first:last]
+        if first and (first == len(self.times) or self.times[first] > start):
+            times, rows = np.append(start, times), self.rows[first - 1 : last]
+        lines = rows.T.tolist()
+        if np.isnan(rows).any():
+            lines = [[None if number != number else number for number in line] for line in lines]
+        return Series(self.names, times.tolist(), lines) if times.size else Series([], [], [])
+
+
+_NONE = _Columns([], np.empty(0), np.empty((0, 0)))
+
+
+def _columns(parts: Iterable[tuple[np.ndarray[Any, Any], list[Any]]]) -> _Columns:
+    """Return what `numbers_in` makes of values that come in parts, mostly as arrays from the beginning."""
+    times, blocks, is_list = [], [], False
+    for instants, values in parts:
+        array, has_items = stacked(values), isinstance(values[0], np.ndarray | list)
+        if isinstance(array, np.ndarray) and array.ndim == 1 + has_items and array[:1].size <= MOST_LINES:
+            block = array.reshape(len(values), -1).astype(np.float64)
+            block[~np.isfinite(block)] = np.nan
+            is_list = is_list or array.ndim == 2
+        else:
+            found = numbers_in(zip(instants.tolist(), values, strict=True))
+            block = np.array(found.lines, np.float64).T if found.lines else np.full((len(values), 1), np.nan)
+            is_list = is_list or found.names[:1] == ["[0]"]
+        times.append(instants)
+        blocks.append(block)
+    width = max([block.shape[1] for block in blocks], default=0)
+    rows = [np.pad(block, ((0, 0), (0, width - block.shape[1])), constant_values=np.nan) for block in blocks]
+    if not rows or np.isnan(whole := np.concatenate(rows)).all():
+        return _NONE
+    return _Columns([f"[{index}]" for index in range(width)] if is_list else [""], np.concatenate(times), whole)
 
 
 def _unfetched(it: Any) -> Any:

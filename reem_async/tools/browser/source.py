@@ -175,6 +175,7 @@ class Status(NamedTuple):
     end: float  # the newest instant
     lost: str = ""  # why nothing can be read at the moment; empty if all is well
     note: str = ""  # what else is to be said of the past that is shown; usually empty
+    part: float = 1.0  # how much is done of what is being read, from 0 to 1; 1 if nothing is
 
 
 class Sample(NamedTuple):
@@ -214,6 +215,10 @@ class Source(Protocol):
     async def start(self) -> None: ...
     async def close(self) -> None: ...
     def status(self) -> Status: ...
+
+    # Waits until it is known from when to when there is a past.
+    async def opened(self) -> None:
+        return
 
     # Notes how many pages are open.
     def shown_on(self, pages: int) -> None: ...
@@ -275,8 +280,8 @@ def rate_span(at: float, start: float, end: float) -> tuple[float, float] | None
 
 
 # Items of a list or vector up to which each is drawn as a line over time.
-_MOST_LINES = 16
-_LARGEST_VECTOR = 8 * _MOST_LINES  # bytes
+MOST_LINES = 16
+_LARGEST_VECTOR = 8 * MOST_LINES  # bytes
 
 
 def numbers_in(samples: Iterable[tuple[float, Any]]) -> Series:
@@ -329,9 +334,9 @@ def _row(value: Any) -> Any:
     array = value.whole if isinstance(value, Frame) else value
     if isinstance(array, np.ndarray):
         return (
-            array.tolist() if array.ndim == 1 and 0 < array.size <= _MOST_LINES and array.dtype.kind in "biuf" else None
+            array.tolist() if array.ndim == 1 and 0 < array.size <= MOST_LINES and array.dtype.kind in "biuf" else None
         )
-    return (value if 0 < len(value) <= _MOST_LINES else None) if isinstance(value, list) else value
+    return (value if 0 < len(value) <= MOST_LINES else None) if isinstance(value, list) else value
 
 
 def is_small_vector(value: Any) -> bool:

@@ -323,15 +323,19 @@ class Log:
         numbers = self._past.timeline.channels_between(up_to(after), up_to(until))
         return {it.path for number, it in self._past.of_channel.items() if number in numbers and it.role in NEWS}
 
-    def news_times(self, path: Path) -> np.ndarray[Any, Any]:
-        """Return when there was an update of a path, or of what is above or below it, in seconds, sorted: float64."""
-        times: np.ndarray[Any, Any] = self._past.timeline.times(self._past.news_channels(path)).astype(np.float64) / 1e9
+    def news_times(self, path: Path, progress: Callable[[int, int], None] | None = None) -> np.ndarray[Any, Any]:
+        """Return when there was an update of a path, or of what is above or below it, in seconds, sorted: float64.
+
+        `progress` is called with the chunks done and all of them.
+        """
+        found = self._past.timeline.times(self._past.news_channels(path), progress).astype(np.float64)
+        times: np.ndarray[Any, Any] = found / 1e9
         return times
 
     def news_count(self, path: Path, after: Instant, until: Instant) -> int:
         """Return how many such updates there were after one instant and not after another."""
         span = up_to(after), up_to(until)
-        return sum(1 for _ in self._past.timeline.between(self._past.news_channels(path), *span))
+        return self._past.timeline.count(self._past.news_channels(path), *span)
 
     def last_news(self, path: Path, instant: Instant) -> float | None:
         """Return when the last such update before an instant was, None if there was none."""
@@ -560,6 +564,11 @@ class LogPath:
         """Yield what `history` returns one by one, for what is larger than memory."""
         for instants, found in self._read(start, end, clock):
             yield from zip(map(seconds, instants), found, strict=True)
+
+    def outlines(self) -> Iterator[tuple[list[int], list[Any]]]:
+        """Yield instants in ns and values, many at a time; arrays that are not short are `Reference`, and not read."""
+        for instants, trees, _ in self._log._past.batches(self.path, -1, _END):
+            yield instants, [None if tree is MISSING else tree for tree in trees]
 
     def _read(
         self, start: Instant | None, end: Instant | None, clock: str

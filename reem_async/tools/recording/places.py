@@ -149,12 +149,24 @@ class Timeline:
             if number not in self._container.lost and wanted[info.channels].any():
                 yield info
 
-    def times(self, channels: Iterable[int]) -> Numbers:
+    def times(self, channels: Iterable[int], progress: Progress | None = None) -> Numbers:
+        """Return the log times of all messages of some channels, sorted."""
         wanted, found = _mask(channels), [np.empty(0, np.uint64)]
-        for info in self.chunks_with(wanted, -1, _END):
+        chunks = list(self.chunks_with(wanted, -1, _END))
+        for done, info in enumerate(chunks):
             index = self._container.index(info)
             found.append(index.times[wanted[index.entries()]])
+            if progress is not None:
+                progress(done + 1, len(chunks))
         return np.sort(np.concatenate(found))
+
+    def count(self, channels: Iterable[int], after: int, until: int) -> int:
+        """Return how many messages of some channels are later than `after` and not later than `until`."""
+        wanted, total = _mask(channels), 0
+        for info in self.chunks_with(wanted, after, until):
+            index = self._container.index(info)
+            total += int(np.count_nonzero(wanted[index.entries()] & _between(index.times, after, until)))
+        return total
 
     def channels_between(self, after: int, until: int) -> set[int]:
         found = np.zeros(_CHANNELS, bool)

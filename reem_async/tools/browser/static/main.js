@@ -31,14 +31,19 @@ const app = {
   },
 
   spanFrom(said) {
+    const begins = !this.span.end && said.end; // the recording is open now
     this.span = { start: said.start, end: said.end };
+    reading.hidden = said.part === 1;
+    reading.value = said.part;
     lost("server", said.lost);
     document.getElementById("source").title = said.note || config.title;
     time.show();
+    if (begins && !config.live) { time.loadActivity(); this.refresh(); }
     if (config.live && this.at !== null && this.at < said.start - 0.5) this.seek(said.start); // it has left the buffer
   },
 
   seek(at) {
+    if (!this.span.end) return; // nothing is known yet
     if (at !== null) at = Math.min(Math.max(at, this.span.start), this.span.end);
     this.previous = this.at ?? this.span.end; // from when on changes are marked
     this.at = at;
@@ -105,6 +110,7 @@ const app = {
   },
 };
 
+const reading = document.getElementById("reading");
 const troubles = new Map();
 
 // What is said in plain words of what is wrong; the details are shown when the pointer is on it.
@@ -222,7 +228,7 @@ function decoded(text) {
 async function route() {
   const address = location.pathname.startsWith("/view/") ? decoded(location.pathname.slice(6)) : "";
   const at = Number(new URLSearchParams(location.search).get("at"));
-  app.at = at ? Math.min(Math.max(at, app.span.start), app.span.end) : null;
+  app.at = !at ? null : app.span.end ? Math.min(Math.max(at, app.span.start), app.span.end) : at;
   await app.layouts.open(location);
   app.go(address, false);
 }

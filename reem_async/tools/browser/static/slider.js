@@ -13,6 +13,8 @@ export class TimeBar {
     this.dragging = false;
     this.playing = null;
     this.counts = null;
+    this.origin = app.span.start;
+    this.slider.max = Math.max(app.span.end - app.span.start, 0.001).toFixed(3); // also before the first answer
     if (!app.config.live) {
       this.live.textContent = "End";
       this.live.title = "To the end (l)";
