@@ -24,8 +24,8 @@ from ...plan.trees import MISSING, get, mapped
 from ..recording.align import stacked
 from ..recording.log import ArrayHandle, Log, open_log
 from .source import (
-    Loss,
     MOST_LINES,
+    Loss,
     Node,
     Page,
     Sample,
