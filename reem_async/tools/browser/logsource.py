@@ -47,6 +47,7 @@ Step = Callable[[int, int], None]
 
 _CACHED = 8  # states that are kept: neighbouring instants are asked for together
 _COUNTED = 64  # paths of which the numbers of updates over time are kept
+_PART = 0.2  # of a recording; the numbers of less than that are read each time, those of more are kept
 _SERIES_BYTES = 64 << 20  # of the numbers over time that are kept, for a page that zooms
 _ROUNDING = 1e-6
 """Seconds: instants here are floats, those in the file nanoseconds; what happens at an instant belongs to it."""
@@ -228,24 +229,29 @@ class LogSource(Source):
         return self._counts[path, bins]
 
     async def series(self, path: Path, start: float, end: float) -> Series:
-        return await self._read(lambda step: self._numbers(path, step).between(start, end))
+        return await self._read(lambda step: self._numbers(path, start, end, step).between(start, end))
 
-    def _numbers(self, path: Path, step: Step) -> _Columns:
-        if path not in self._series:
-            at_end = get(self._state(self._when(None)), path)
-            # Large arrays are not read for this. What was deleted at the end may have been numbers before.
-            is_drawn = not isinstance(at_end, Unfetched | np.ndarray) or is_small_vector(at_end)
-            self._series[path] = _columns(self._outlines(path, step)) if is_drawn else _NONE
-            while sum([it.bytes for it in self._series.values()]) > _SERIES_BYTES and len(self._series) > 1:
-                self._series.popitem(last=False)
-        self._series.move_to_end(path)
-        return self._series[path]
+    def _numbers(self, path: Path, start: float, end: float, step: Step) -> _Columns:
+        if path in self._series:
+            self._series.move_to_end(path)
+            return self._series[path]
+        at_end = get(self._state(self._when(None)), path)
+        if isinstance(at_end, Unfetched | np.ndarray) and not is_small_vector(at_end):
+            return _NONE  # large arrays are not read for this
+        if end - start < _PART * self.log.duration:
+            return _columns(self._outlines(path, self.log.last_news(path, start) or start, end, step))
+        found = self._series[path] = _columns(self._outlines(path, None, None, step))
+        while sum([it.bytes for it in self._series.values()]) > _SERIES_BYTES and len(self._series) > 1:
+            self._series.popitem(last=False)
+        return found
 
-    def _outlines(self, path: Path, step: Step) -> Iterator[tuple[np.ndarray[Any, Any], list[Any]]]:
-        start, every = self.log.start, int(self.log.duration * 1e3)
-        for instants, values in self.log[path].outlines():
+    def _outlines(
+        self, path: Path, start: float | None, end: float | None, step: Step
+    ) -> Iterator[tuple[np.ndarray[Any, Any], list[Any]]]:
+        first, every = self.log.start, int(self.log.duration * 1e3)
+        for instants, values in self.log[path].outlines(start, end):
             times = np.array(instants, np.int64).astype(np.float64) / 1e9
-            step(int((times[-1] - start) * 1e3), every)
+            step(int((times[-1] - first) * 1e3), every)
             yield times, values
 
     async def losses(self, path: Path, start: float, end: float) -> list[Loss]:

@@ -374,8 +374,7 @@ class Log:
             partial: An update is left out, and counted in `unreadable`, if anything in its value is damaged or was
                 not recorded. With this, only that is left out of the value; an item of a list is None then.
         """
-        after = -1 if start is None else before(start)
-        until = _END if end is None else up_to(end)
+        after, until = _span(start, end)
         for ref, stream, value in self._news(after, until, patterns):
             read = resolve(value, self._whole) if partial else self._whole(value)
             if value is MISSING:
@@ -519,6 +518,10 @@ class Log:
         return f"<reem recording {self.path}, {self.duration:.1f} s>"
 
 
+def _span(start: Instant | None, end: Instant | None) -> tuple[int, int]:
+    return -1 if start is None else before(start), _END if end is None else up_to(end)
+
+
 class LogPath:
     """One path of a recording."""
 
@@ -565,9 +568,11 @@ class LogPath:
         for instants, found in self._read(start, end, clock):
             yield from zip(map(seconds, instants), found, strict=True)
 
-    def outlines(self) -> Iterator[tuple[list[int], list[Any]]]:
+    def outlines(
+        self, start: Instant | None = None, end: Instant | None = None
+    ) -> Iterator[tuple[list[int], list[Any]]]:
         """Yield instants in ns and values, many at a time; arrays that are not short are `Reference`, and not read."""
-        for instants, trees, _ in self._log._past.batches(self.path, -1, _END):
+        for instants, trees, _ in self._log._past.batches(self.path, *_span(start, end)):
             yield instants, [None if tree is MISSING else tree for tree in trees]
 
     def _read(
@@ -576,8 +581,7 @@ class LogPath:
         """Yield instants in ns and values, many at a time."""
         if clock not in ("recorder", "publisher"):
             raise BadValue(f"clock={clock!r:.40} is neither 'recorder' nor 'publisher'")
-        after = -1 if start is None else before(start)
-        until = _END if end is None else up_to(end)
+        after, until = _span(start, end)
         past = self._log._past
         if clock == "recorder":
             for instants, trees, is_plain in past.batches(self.path, after, until):

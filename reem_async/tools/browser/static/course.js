@@ -104,19 +104,43 @@ export class Course {
   async update(signal) {
     const { app, others } = this, now = performance.now(), live = app.config.live && app.at === null, [start, end] = app.axis.read;
     const fixed = live ? "" : app.config.live ? Math.floor(app.span.end / 2) : "log", key = JSON.stringify([others, start, app.axis.follows && end, fixed]);
-    if (key !== this.key || (live && now > this.asked + this.pause)) {
+    if (key !== this.wanted || (live && now > this.asked + this.pause)) {
       this.asked = now;
-      const ask = (path) => getJson("series", { path, start, end: app.axis.follows ? null : end }, signal);
-      const [first, ...more] = await Promise.all([ask(this.address), ...others.map((path) => ask(path).catch((error) => { if (!error.status) throw error; return { names: [], times: [], lines: [] }; }))]);
-      const missing = others.filter((_, index) => !more[index].lines.length);
-      if (missing.length && this.told !== `${missing}`) toast(`No numbers at ${missing.join(", ")}`);
-      this.told = `${missing}`;
-      this.data = others.length ? [first, ...more].map((each, index) => ({ ...each, key: index ? others[index - 1] : this.address })) : first;
-      this.key = key;
+      this.wanted = key;
+      const reading = this.read(key, signal).catch((error) => { this.wanted = null; throw error; });
+      if (app.config.live) await reading;
+      else reading.then(() => this.draw(), (error) => app.failed(error)); // it may take seconds, in which the page shows other instants
     }
-    this.card.hidden = ![this.data].flat().some((each) => each.lines.length);
-    if (!this.card.hidden) this.plot.set(this.data, app.at);
+    this.draw();
   }
+
+  async read(key, signal) {
+    const { app, others } = this, [start, end] = app.axis.read;
+    const get = (path) => getJson("series", { path, start, end: app.axis.follows ? null : end }, signal);
+    const ask = (path) => app.config.live ? get(path) : inTurn(() => get(path));
+    const [first, ...more] = await Promise.all([ask(this.address), ...others.map((path) => ask(path).catch((error) => { if (!error.status) throw error; return { names: [], times: [], lines: [] }; }))]);
+    if (key !== this.wanted) return;
+    const missing = others.filter((_, index) => !more[index].lines.length);
+    if (missing.length && this.told !== `${missing}`) toast(`No numbers at ${missing.join(", ")}`);
+    this.told = `${missing}`;
+    this.data = others.length ? [first, ...more].map((each, index) => ({ ...each, key: index ? others[index - 1] : this.address })) : first;
+  }
+
+  draw() {
+    if (!this.data) return;
+    this.card.hidden = ![this.data].flat().some((each) => each.lines.length);
+    if (!this.card.hidden) this.plot.set(this.data, this.app.at);
+  }
+}
+
+// Two at a time: a browser has six connections for all that a page asks, and the slider needs some.
+const turns = [Promise.resolve(), Promise.resolve()];
+let turn = 0;
+
+function inTurn(work) {
+  const lane = turn++ % turns.length, result = turns[lane].then(work);
+  turns[lane] = result.catch(() => {});
+  return result;
 }
 
 export const ROW = "application/x-reem-key"; // the type of a row of the tree that is dragged
