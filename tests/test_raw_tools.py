@@ -5,8 +5,8 @@ import html
 import json
 import re
 import shutil
+import signal
 import subprocess
-import threading
 import time
 
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 import redis
 from browserkit import client_of, live, served
 from clikit import CommandLine, said_until
-from conftest import ROOT, assert_same, eventually, url_of_user
+from conftest import PATIENCE, ROOT, assert_same, eventually, url_of_user
 
 import reem
 from reem.errors import BadValue
@@ -227,25 +227,38 @@ def lab_program(tmp_path_factory):
 @pytest.mark.long
 def test_a_robot_in_c_is_seen_by_all_tools(server, lab_program, file):
     """JSON at 1 kHz, images at 30 Hz, a hash and a stream; the tools get no option."""
-    port, seconds = server.url.rpartition(":")[2], 10
-    words = [lab_program, "127.0.0.1", port, str(seconds)]
-    cli, path = CommandLine(server.url, ""), "sai::sensors::Panda::joint_positions"
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as robot:
+    port, path = server.url.rpartition(":")[2], "sai::sensors::Panda::joint_positions"
+    cli = CommandLine(server.url, "")
+    with subprocess.Popen([lab_program, "127.0.0.1", port, "600"], stdout=subprocess.PIPE, text=True) as robot:
         try:
             with served(live(server.url)) as (address, _), client_of(address) as page:
-                recording = threading.Thread(
-                    target=lambda: cli.process("record", "-o", file, "--duration", seconds - 2)
-                )
-                recording.start()
-                eventually(lambda: "camera::rgb" in page.rows())
-                assert "camera::rgb  bytes  921.6 kB  (raw string)" in cli("tree").stdout
-                recording.join()
-                assert len(page.json("series", path=path)["times"]) > 10
-            assert robot.communicate(timeout=30)[0].split()[:2] == ["writes", str(seconds * 1000)]
+                with cli.running("record", "-o", file, "--json") as recording:
+                    while json.loads(recording.stdout.readline())["messages"] < 200:  # each key has its share
+                        assert robot.poll() is None
+                    assert "camera::rgb  bytes  921.6 kB  (raw string)" in cli("tree").stdout
+                    eventually(lambda: len(page.json("series", path=path)["times"]) > 10)
+                    recording.send_signal(signal.SIGINT)
+                    status = json.loads(recording.communicate(timeout=PATIENCE)[0].splitlines()[-1])
+                assert "camera::rgb" in page.rows()
+            robot.terminate()
+            turns = int(robot.communicate(timeout=PATIENCE)[0].split()[1])
         finally:
             robot.kill()
+    assert (status["dropped"], status["lost"]) == (0, 0)
+    assert json.loads(server_value(server, path))[-1] == turns - 1
     with open_log(file) as log:
-        counts = {name: sum(1 for _ in log[name].values()) for name in (path, "camera::rgb", "battery", "imu")}
-    assert min(counts["battery"], counts["imu"]) > 1
-    assert counts[path] > 10
-    assert counts["camera::rgb"] > 2
+        joints = np.array([value for _, value in log[path].values()])
+        images = [np.frombuffer(value, np.uint8).reshape(480, 640, 3) for _, value in log["camera::rgb"].values()]
+        counts = [len(joints), len(images), *(sum(1 for _ in log[name].values()) for name in ("battery", "imu"))]
+    assert min(counts) > 5, counts
+    assert min(counts[:2]) > 10, counts
+    assert (np.diff(joints[:, -1]) > 0).all()
+    assert np.allclose(joints[:, 0], np.sin(joints[:, -1] / 1000), atol=1e-6)
+    for image in images:  # a white bar on one colour: none is torn, or of two pictures
+        assert (image == image[0]).all()
+        assert np.isin(image[0], (255, image[0, -1, 0])).all()
+
+
+def server_value(server, name):
+    with redis.Redis.from_url(server.url) as robot:
+        return robot.get(name)

@@ -17,7 +17,6 @@ Whatever goes wrong on the way, the value is fetched from the server, as if this
 from __future__ import annotations
 
 import collections
-import functools
 import os
 import time
 from collections.abc import Sequence
@@ -59,11 +58,15 @@ class LocalPath:
         self._pid = os.getpid()
         self._segments: dict[str, Segment] = {}
         self._audiences: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
+        # What is made when first used. Not by functools.cached_property: it has a lock in Python 3.11, which a child that
+        # is forked meanwhile would find taken for good.
+        self._made: dict[str, Any] = {}
 
-    @functools.cached_property
+    @property
     def reader(self) -> LocalReader:
         """What looks into the memory of publishers near by; only where there is a `host`."""
-        return LocalReader()
+        reader: LocalReader = self._made.get("reader") or self._made.setdefault("reader", LocalReader())
+        return reader
 
     @property
     def host(self) -> str:
@@ -82,10 +85,11 @@ class LocalPath:
         host = self.host
         return self.reader.view(slot, size, passed, is_near=slot.host == host) if host else None
 
-    @functools.cached_property
+    @property
     def subscribers(self) -> Subscribers:
         """The subscribers that are notified early; only where there is a `host`."""
-        return Subscribers()
+        found: Subscribers = self._made.get("subscribers") or self._made.setdefault("subscribers", Subscribers())
+        return found
 
     def is_to_ask(self, keys: Keys) -> bool:
         """Return whether it is not known any more how many near by listen to a key."""
@@ -156,7 +160,6 @@ class LocalPath:
     def close(self) -> None:
         """Give all memory back; what subscribers look into stays as long as they do."""
         self._off = True
-        for each in ("reader", "subscribers"):
-            if each in vars(self):
-                getattr(self, each).close()
+        for each in list(self._made.values()):
+            each.close()
         self._segments = {}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import struct
-from functools import cache, cached_property
+from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar, Self
 
@@ -303,7 +303,7 @@ class ImageShip(BlobShip):
     def __init__(self, raw: bool = False) -> None:
         self._raw = raw
 
-    @cached_property
+    @property
     def raw(self) -> ImageShip:
         """The same ship for readers that pass pictures on, and do not look into them."""
         return type(self)(raw=True)

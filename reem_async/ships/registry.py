@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from functools import cached_property
 from typing import Any
 
 from ..errors import BadData, BadType
@@ -76,6 +75,7 @@ class Ships:
         self.asynchronous = any(map(inspect.iscoroutinefunction, methods))
         self._registered: list[Registered] = []
         self._by_label: dict[str, Registered] = {}
+        self._raw: Ships | None = None
         self.claimed: frozenset[type] = frozenset()  # JSON types of which a ship takes some values
         self.asks_first = bool(self.given)  # whether there are such types, or the ships were not asked yet
         # Ships that have to be awaited cannot be asked here; `ready` is called before the first call that needs them.
@@ -83,11 +83,13 @@ class Ships:
             with suppress(StopIteration):  # which says that it is done: it waits for nothing
                 self.ready().send(None)
 
-    @cached_property
+    @property
     def raw(self) -> Ships:
         """The same ships, but with pictures as `Jpeg` and `Png`, not decoded; itself if it has none for them."""
-        ships = [ship.raw if isinstance(ship, ImageShip) else ship for ship in self.given]
-        return Ships(ships, self.new_recorder) if ships != self.given else self
+        if self._raw is None:
+            ships = [ship.raw if isinstance(ship, ImageShip) else ship for ship in self.given]
+            self._raw = Ships(ships, self.new_recorder) if ships != self.given else self
+        return self._raw
 
     async def ready(self) -> None:
         """Ask the ships for their labels and read commands; does nothing the second time."""

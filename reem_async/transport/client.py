@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import redis
 import redis.asyncio
 
+from ..concurrency.locks import Inherited
 from ..errors import Misuse, NoJsonSupport
 from .options import Options
 from .protocol import Packer
@@ -58,6 +60,21 @@ class _AsyncioClient(redis.asyncio.Redis):
             raise _in_words(error, command_name) from None
 
 
+class _Pool(redis.ConnectionPool):
+    """With locks of its own in a forked child, which would find those of its parent taken for good."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        _pools.add(self)
+
+    def _forked(self) -> None:
+        for holder, name in ((self, "_lock"), (self, "_fork_lock"), (self._event_dispatcher, "_lock")):
+            setattr(holder, name, threading.RLock())
+
+
+_pools = Inherited(_Pool._forked)
+
+
 def _settings(options: Options) -> dict[str, Any]:
     """Return how connections are made: replies are str, in the shapes of protocol 2."""
     if type(options) is not Options:
@@ -72,7 +89,7 @@ def _settings(options: Options) -> dict[str, Any]:
 def client(options: Options) -> Any:
     kind = getattr(redis.connection, options.connection_class)
     settings = {"command_packer": Packer(), **_settings(options)}
-    return _Client.from_pool(redis.ConnectionPool(connection_class=kind, **settings))
+    return _Client.from_pool(_Pool(connection_class=kind, **settings))
 
 
 def asyncio_client(options: Options) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 from ...connection import RedisInterface
 from ...coordination.calls import statistics
 from ...coordination.parameters import SPECIFICATIONS, StoredParameter, publish, stored_parameters
-from ...errors import BadType, ConnectionLost, MissingKey, NotAllowed, NotConnected, ServerNotReady
+from ...errors import BadType, ConnectionLost, MissingKey, NotAllowed, NotConnected, ServerNotReady, WrongKind
 from ...plan.paths import Path, show
 from ...plan.trees import MISSING
 from ...store.catalog import Outline, outline
@@ -199,6 +199,10 @@ class LiveSource:
         elif at is None or (self.history.unchanged(path, at) and self._follower.is_settled(name)):
             try:
                 return Sample(await self._read(path), 0.0, self._age(path, at))
+            except WrongKind:
+                if not await self._raw.find(name):
+                    raise
+                at = self.history.clock.now()
             except _AWAY:
                 if at is None:
                     raise

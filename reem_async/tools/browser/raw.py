@@ -15,8 +15,10 @@ import numpy as np
 
 from ...concurrency.queues import Last
 from ...errors import BadKey, BadType, BadValue, NotAllowed
+from ...plan.keys import DOCUMENT
 from ...plan.paths import Path, check_top_key, show
 from ...plan.placeholders import Unfetched
+from ...plan.raw import RawValue, read
 from ...plan.trees import MISSING, get, walk
 from ...pubsub.raw_watch import RawUpdate, RawWatch
 from ...pubsub.refresh import BACKGROUND_RATE
@@ -110,6 +112,14 @@ class RawFollower:
                 await self._take(update)
         except NotAllowed as error:
             self.refused = f"keys of programs without REEM are not shown: {error}"
+
+    async def find(self, name: str) -> bool:
+        """Have the buffer know a key that was stored just now; return whether it is of another program."""
+        if self._task is not None and name not in self.kinds:
+            it: RawValue = await self._session.run(read(name, _LARGEST))
+            if it.kind not in (DOCUMENT, "none"):
+                await self._take(RawUpdate(name, it.value, it.value, missed=0, kind=it.kind, size=it.size))
+        return name in self.kinds
 
     async def _take(self, update: RawUpdate) -> None:
         name, history = update.path, self._history

@@ -256,7 +256,7 @@ class KeyRecorder:
             if not self._stepped:
                 logger.warning(
                     "%s: the publisher's time went back by %.3f s: its clock was set, or programs with different "
-                    "clocks publish it (reported once; `clock_steps` counts)",
+                    "clocks or delays publish it (reported once; `clock_steps` counts)",
                     self._name,
                     back,
                 )

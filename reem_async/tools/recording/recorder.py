@@ -7,6 +7,7 @@ import contextlib
 import os
 import platform
 import pwd
+import threading
 import time
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
@@ -48,6 +49,9 @@ _FETCHES = 8
 _CLOCK_READINGS = 4  # round trips
 _PATIENCE = 3.0
 """Seconds in which what was announced before the end is still fetched."""
+_NAMING = threading.RLock()
+"""Held to ask the C library for a user's name: it has a lock that a child forked meanwhile would find taken for good."""
+os.register_at_fork(before=_NAMING.acquire, after_in_parent=_NAMING.release, after_in_child=_NAMING.release)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +73,7 @@ class RecorderStatus:
         failed: Readings of samples that failed: what is there cannot be read, or the server did not answer.
         rate: Messages a second, on average.
         clock_steps: How often the publisher's times of a key went back by over 10 ms: its clock was set, or another
-            program with another clock publishes it.
+            program with another clock, or with updates that were longer on their way, publishes it.
     """
 
     seconds: float
@@ -523,6 +527,7 @@ def description(
 
 def _user() -> str:
     try:
-        return pwd.getpwuid(os.getuid()).pw_name
+        with _NAMING:
+            return pwd.getpwuid(os.getuid()).pw_name
     except KeyError:  # this user has no name
         return ""
