@@ -50,7 +50,7 @@ _CLOCK_READINGS = 4  # round trips
 _PATIENCE = 3.0
 """Seconds in which what was announced before the end is still fetched."""
 _NAMING = threading.RLock()
-"""Held to ask the C library for a user's name: it has a lock that a child forked meanwhile would find taken for good."""
+"""Held to ask the C library for a user's name: it has a lock that a child forked meanwhile would find taken."""
 os.register_at_fork(before=_NAMING.acquire, after_in_parent=_NAMING.release, after_in_child=_NAMING.release)
 
 
