@@ -57,6 +57,7 @@ class Recorder:
         self._core = core.Recorder(interface._followers, *given, **options)
 
     status = shares(core.Recorder.status)
+    files = shares(core.Recorder.files)
     start = waits(core.Recorder.start)
     stop = waits(core.Recorder.stop)
     wait = waits(core.Recorder.wait)

@@ -49,6 +49,12 @@ def record(
         float, typer.Option(min=0.05, metavar="SECONDS", help="Write the whole of the keys so often.")
     ] = 5.0,
     compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
+    split: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE|TIME", help="Begin another file after so much, such as 1GB or 10min: run-0001.mcap."
+        ),
+    ] = None,
     force: Force = False,
     ships: Ships = None,
     last: Annotated[
@@ -86,11 +92,15 @@ def record(
     value at a path becomes true, with {time} in its name in UTC, but not while another one is being written.
     The memory has 256 MB: what it cannot hold is dropped, oldest first, and counted.
 
+    With --split the files are run-0001.mcap, run-0002.mcap and so on. Each can be read by itself; several are read as
+    one: reem log info run-*.mcap.
+
     With --background it disturbs them least, but drops and counts updates if they use all processors.
 
     Examples:
         reem record -o run.mcap
         reem record arm 'cam_*' --duration 60
+        reem record -o run.mcap --split 1GB
         reem record --background            beside a tight control loop
         reem record --services policy       its updates, and all calls
         reem record --sample keys.csv       its lines: arm.joint, 0.01
@@ -127,6 +137,7 @@ def record(
             keyframe=keyframe,
             compression=compression,
             overwrite=force,
+            split=split,
             last=last,
         )
         box = None if last is None else _Box(recorder, output, on, after, force=force, as_json=as_json)
@@ -260,7 +271,7 @@ def _begin(recorder: Recorder, duration: float | None, as_json: bool, box: _Box 
     elif box is not None:
         note(f"recording into memory, and into {recorder.path} {box.when}")
     else:
-        note(f"recording into {recorder.path} " + ("until Ctrl-C" if duration is None else f"for {duration:g} s"))
+        note(f"recording into {recorder.files[0]} " + ("until Ctrl-C" if duration is None else f"for {duration:g} s"))
 
 
 def _nothing(patterns: list[str], failed: int) -> str:
@@ -276,11 +287,14 @@ def _nothing(patterns: list[str], failed: int) -> str:
 def _end(recorder: Recorder, as_json: bool) -> None:
     status = recorder.status
     if as_json:
-        emit_json(figures(status, 3) | {"file": str(recorder.path), "ended": True})
+        names = [str(file) for file in recorder.files]
+        emit_json(figures(status, 3) | {"file": names[0], "files": names, "ended": True})
         return
-    size = recorder.path.stat().st_size if recorder.path.exists() else 0
+    size = sum(file.stat().st_size for file in recorder.files if file.exists())
     what = f"{status.messages} messages, {size_text(status.bytes)} in {_clock(status.seconds)}"
-    emit(clean(f"{recorder.path}: {what}, {size_text(size)} in the file; {_missing(status)}"))
+    first, *more = recorder.files
+    name = f"{first} to {more[-1]}" if more else first
+    emit(clean(f"{name}: {what}, {size_text(size)} in the file; {_missing(status)}"))
 
 
 def _missing(status: RecorderStatus) -> str:

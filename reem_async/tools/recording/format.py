@@ -43,6 +43,8 @@ class Role(StrEnum):
     update or a deletion."""
     SAMPLE = "sample"
     """What was read at a path in turn; in the file an update or a deletion."""
+    SPLIT = "split"
+    """From here on another file is written."""
     FOUND = "found"
     """What a read found at the place of a skipped update; in the file an update or a deletion."""
 

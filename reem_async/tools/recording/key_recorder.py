@@ -228,6 +228,11 @@ class KeyRecorder:
         """Whether the key is gone, and nothing of it is left to be read, looked at or written."""
         return self.absent and self.busy is None and not self._queue.items and not self.looks.due
 
+    @property
+    def waits_since(self) -> int | None:
+        items = self._queue.items
+        return items[0].stamp[0] if items else None
+
     def on_event(self, event: Event) -> None:
         arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)
         stamp = self._collector.clock.stamp(arrived), published(event.time), event.sequence
@@ -450,6 +455,11 @@ class RecordedKeys:
             busy := [recorder.busy for recorder in self._recorders.values() if recorder.busy]
         ) and time.monotonic() < deadline:
             await asyncio.wait(busy, timeout=deadline - time.monotonic())
+
+    def waiting(self) -> dict[str, int]:
+        """Return the keys of which news wait for a value that is on its way, and the log time of the first."""
+        found = {name: recorder.waits_since for name, recorder in self._recorders.items()}
+        return {name: since for name, since in found.items() if since is not None}
 
     def cancel(self) -> None:
         for recorder in self._recorders.values():

@@ -18,11 +18,11 @@ from ...plan.paths import Path, Pattern, below, related
 from ...plan.trees import MISSING, get, same
 from ...ships.images import EncodedImage
 from ...ships.registry import Ships
-from .container import Container, Ref
+from .container import Container, Message, Ref
 from .foreign import Foreign
 from .format import NEWS, DamagedRecording, Kind, Role
 from .joined import Files
-from .layout import PathReader, decode, from_json
+from .layout import EncodedMessage, PathReader, decode, from_json
 from .places import Timeline, messages_in
 from .sink import CHANNELS
 from .stored import LOST, Reference, applied, opened, reference_to
@@ -224,12 +224,27 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             if not isinstance(value, EncodedImage):
                 return value
             return (ships or self._ships).labelled(it.label, it.shown).ship.interpret_read([value.data])
-        for channel in self._parts.get(it.path, ()):
-            ref = self.timeline.latest(channel, it.at, it.at - 1)
-            message = None if ref is None else self._container.message(ref)
-            if message is not None and self._container.channels[channel].message_encoding == "protobuf":
-                return self._decoded(self._container.channels[channel], message.data, ships or self._ships)
+        found = self._message_of(it)
+        if found is not None:
+            return self._decoded(found[0], found[1].data, ships or self._ships)
         raise DamagedRecording(f"{it.shown}: {it.summary or it.label}, recorded at {it.at} ns, is damaged or missing")
+
+    def _message_of(self, it: Reference) -> tuple[Channel, Message] | None:
+        for number in self._parts.get(it.path, ()):
+            ref = self.timeline.latest(number, it.at, it.at - 1)
+            message, channel = None if ref is None else self._container.message(ref), self._container.channels[number]
+            if message is not None and channel.message_encoding == "protobuf":
+                return channel, message
+        return None
+
+    def encoded(self, it: Reference) -> EncodedMessage | None:
+        """Return the message of a value as it is in the file; None if it is damaged."""
+        found = self._message_of(it)
+        if found is None:
+            return None
+        channel, message = found
+        schema = self._container.schemas.get(channel.schema_id)
+        return EncodedMessage(schema.name if schema else "", channel.metadata.get("reem.channels", ""), [message.data])
 
     def changed(self, name: str, until: int) -> int:
         """Return the log time of the last message on a key until an instant, -1 if there is none."""

@@ -36,7 +36,8 @@ from .key_recorder import RecordedKeys
 from .output import FileGone
 from .raw_keys import RawRecorder
 from .sample import Sample, Sampler, samples_of
-from .sink import Sink
+from .sink import SPLIT, Sink
+from .split import Split
 from .times import PATIENCE, Arrivals, Clock
 from .writer_thread import Operation, WriterThread
 
@@ -116,6 +117,9 @@ class Recorder:
         overwrite: Replace the file if it exists; it stays as it is until recording has begun.
         compression: "zstd", "lz4" or "none".
         queue_bytes: What may wait for the disk.
+        split: Go on in another file after so much of a file or time, such as "1GB" or "10min". The files are
+            run-0001.mcap, run-0002.mcap and so on. Each begins with all that is there, so it can be read by itself;
+            `open_log` reads several as one.
         last: A black box: so many seconds are kept in memory, and there is no file but by `save`. `path` is not used.
         memory: Bytes that these may take, with what each key held before them. The oldest go before their time if they
             would take more, which `status.dropped` counts. Plain values that the keys hold are kept whatever they take.
@@ -136,6 +140,7 @@ class Recorder:
         overwrite: bool = False,
         compression: str = "zstd",
         queue_bytes: int = 256 << 20,
+        split: str | None = None,
         last: float | None = None,
         memory: int = 256 << 20,
     ) -> None:
@@ -145,7 +150,13 @@ class Recorder:
         check_instance("path", path, (str, FilePath), "use the name of a file")
         if last is not None:
             check_number("last", last, "use seconds, over 0, or None for a file", above=0)
+        if split is not None and last is not None:
+            raise BadValue("split is for a recording into files, and a black box (last) keeps it in memory")
         self.path = FilePath(path)
+        self._split = None if split is None else Split(split, self.path)
+        if self._split is not None:
+            self._split.refuse_others(overwrite=overwrite)
+        self._overwrite = overwrite
         self.patterns = parse_patterns(patterns)
         self.session = interface.session.raw  # pictures go into the file as they are
         self.clock = Clock()
@@ -180,7 +191,7 @@ class Recorder:
         self._box = None if last is None else BlackBox(last, memory)
         self._sink: Sink | None = None
         if self._box is None:
-            self._sink = self._sink_of(self.path, overwrite=overwrite)
+            self._sink = self._next_sink() if self._split else self._sink_of(self.path, overwrite=overwrite)
             self.writer_thread: WriterThread | BlackBox = self._writer_to(self._sink)
         else:
             self.writer_thread = self._box
@@ -188,8 +199,20 @@ class Recorder:
     def _sink_of(self, path: FilePath, *, overwrite: bool, whole: bool = False) -> Sink:
         return Sink(path, self._compression, self._described, overwrite=overwrite, whole=whole)
 
+    def _next_sink(self) -> Sink:
+        assert self._split is not None
+        path, place = self._split.next()
+        self._described |= {SPLIT: place}
+        return self._sink_of(path, overwrite=self._overwrite)
+
     def _writer_to(self, sink: Sink, first: Sequence[Operation] = ()) -> WriterThread:
-        return WriterThread(sink, self.session.ships, self._queue_bytes, self.patterns, first)
+        following = None if self._split is None else self._next_sink
+        return WriterThread(sink, self.session.ships, self._queue_bytes, self.patterns, first, following)
+
+    @property
+    def files(self) -> list[FilePath]:
+        """The files that it has written until now, and the one that it writes to."""
+        return [self.path] if self._split is None else list(self._split.files)
 
     # Lifetime.
 
@@ -221,6 +244,8 @@ class Recorder:
             self._check()
             if self._sink is not None:
                 self._sink.output.appear()
+            if self._split is not None:
+                self._split.remove_others()
         except BaseException:
             await self._end()
             raise
@@ -348,7 +373,7 @@ class Recorder:
         if failure is not None:
             reason = _reason(failure)
             left = "" if isinstance(failure, FileGone) else "; what is in the file by now can be read"
-            raise RecordingFailed(f"{self.path} could not be written any further ({reason}){left}") from failure
+            raise RecordingFailed(f"{self.files[-1]} could not be written any further ({reason}){left}") from failure
 
     async def __aenter__(self) -> Self:
         await self.start()
@@ -374,7 +399,7 @@ class Recorder:
             seconds,
             counts.messages if self._box is None else self._box.messages,
             counts.bytes if self._box is None else self._box.bytes,
-            0 if self._sink is None else self._sink.output.tell(),
+            0 if isinstance(self.writer_thread, BlackBox) else self.writer_thread.file_bytes,
             counts.dropped,
             counts.skipped,
             counts.gaps,
@@ -440,12 +465,22 @@ class Recorder:
                 self._done.set()
                 return
             self._catch_up()
+            self._begin_next_file()
             if time.monotonic() >= due:
                 due += self._keyframe_seconds * max(1, (time.monotonic() - due) // self._keyframe_seconds + 1)
                 if self._monitor is not None and not self.hears_of_changes:
                     with contextlib.suppress(RedisError, OSError):
                         await self._look()
                 self._keyframe_of_all()
+
+    def _begin_next_file(self) -> None:
+        """Have the writer go on in another file if this one is as large or old as files are to be."""
+        writer = self.writer_thread
+        if self._split is None or isinstance(writer, BlackBox) or writer.splitting:
+            return
+        if self._split.is_due(writer.part_bytes):
+            self._pump()  # what has arrived has times before it
+            writer.split(self.clock.stamp(), self._keys.waiting())
 
     async def _search(self) -> bool:
         if self.hears_of_changes:  # else keys are read at each keyframe

@@ -76,6 +76,7 @@ class Sink:
         except OSError as error:
             raise RecordingFailed(f"{path} cannot be written: {error.strerror}") from error
         self.whole = whole  # it gets its name when it is finished, or never
+        self.continues = False  # what is written repeats what the file before has ended with
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[Any, int] = {}
         self._known: dict[Any, list[tuple[Schema, int]]] = {}
@@ -96,7 +97,7 @@ class Sink:
         return self._message(channel, [document.text], stamp)
 
     def _json_channel(self, path: Path, role: Role, kind: Kind, wrapped: bool, found: Schema) -> int:
-        place = path, role, kind, wrapped
+        place = path, role, kind, wrapped, self.continues
         known = self._known.get(place, [])
         for types, channel in known:
             if found == types or fits(found, types):
@@ -110,6 +111,7 @@ class Sink:
         text = orjson.dumps({"$schema": _DRAFT, "title": title, **found})
         schema = self._schema(title, "jsonschema", text)
         extra = {"reem.wrapped": "1"} if wrapped else {}
+        extra |= {CONTINUED: "1"} if self.continues else {}
         channel = self._channel(path, role, kind, "json", schema, **extra)
         self._known[place] = [*known, (found, channel)]
         return channel

@@ -6,12 +6,14 @@ Nothing waits for it. What does not fit into the queue is dropped and counted, a
 from __future__ import annotations
 
 import collections
-import contextlib
 import logging
 import os
 import sys
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -21,12 +23,14 @@ import orjson
 from ...concurrency.tasks import give_way
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
-from ...plan.trees import MISSING, CannotApply, difference, get, replaced, same, walk
+from ...plan.trees import MISSING, CannotApply, difference, get, mapped, replaced, same, walk
 from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
-from .format import Kind, Role
+from .container import Container
+from .format import DamagedRecording, Kind, Role
 from .layout import WRAPPER, JsonMessage, encode, to_json
+from .log_reader import RecordedPast
 from .sink import FullError, Sink
 from .stored import (
     LOST,
@@ -41,6 +45,7 @@ from .stored import (
     reference_to,
     without,
 )
+from .times import STEP
 
 logger = logging.getLogger("reem.recording")
 
@@ -52,6 +57,8 @@ LARGE = (Role.UPDATE, Role.DELETE, Role.STATE, Role.STORED)
 """Roles that are dropped if the queue is full; the others hold nothing."""
 _HURRY = 1 << 20
 """Bytes in the queue from which the thread is woken at once."""
+_MOST_MOVED = 100_000
+"""Values of former files of which it is known what stands for them now."""
 
 _NUMPY = NumpyShip()
 
@@ -113,6 +120,7 @@ class WriterThread:
         limit: int,
         patterns: Sequence[Pattern] = (),
         first: Iterable[Operation] = (),  # are written before all others, and take no room
+        following: Callable[[], Sink] | None = None,  # makes the next file
     ) -> None:
         self.counts = Counts()
         self.failure: Exception | None = None
@@ -135,6 +143,14 @@ class WriterThread:
         # that are gone are not in it.
         self._trees: dict[str, Any] = {}
         self._full = False  # there is no channel any more, which was said
+        self._following = following
+        self._split_at = 0  # the log time of the states that the next file begins with
+        self._begun_at = 0  # and this one
+        self._finished_bytes = 0  # of files that are complete
+        # Since the last split: from when on news of each key are in this file, and what stands for older values here.
+        self._since: dict[str, int] = {}
+        self._moved: dict[tuple[Path, int], Reference] = {}
+        self.splitting = False
         self._thread = threading.Thread(target=self._run, name="reem recorder", daemon=True)
 
     def start(self) -> None:
@@ -143,6 +159,29 @@ class WriterThread:
     @property
     def waiting(self) -> int:
         return self._size
+
+    @property
+    def file_bytes(self) -> int:
+        """Bytes in the file, and in those that are complete."""
+        return self._finished_bytes + self._sink.output.tell()
+
+    @property
+    def part_bytes(self) -> int:
+        """Bytes in the file that is being written."""
+        return self._sink.output.tell()
+
+    def split(self, now: int, waiting: Mapping[str, int]) -> None:
+        """Go on in another file, given the log time, and that of the first news of each key that has some waiting.
+
+        The file begins with a state before all news that will be in it. It may be earlier than the last ones in the
+        file before, by the time for which news wait.
+        """
+        self.splitting = True
+        # Between two steps of the clock, and not twice the same: each value has a place and a time of its own.
+        self._split_at = max(min([now, *[stamp - STEP // 4 for stamp in waiting.values()]]), self._split_at + 1)
+        with self._changed:
+            value = {"now": now, "waiting": set(waiting)}
+            self._queue.append((Operation(Role.SPLIT, ("",), value, (self._split_at, 0, 0), Kind.READ), 0))
 
     def put(self, operation: Operation, size: int) -> bool:
         """Hand over an operation of about `size` bytes; returns whether there was room. Never waits for the disk."""
@@ -183,7 +222,7 @@ class WriterThread:
             self._sink.close()  # it was never started
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError):  # it must never keep the recorded programs waiting
+        with suppress(OSError):  # it must never keep the recorded programs waiting
             # On Linux a thread has a nice value of its own.
             mine = threading.get_native_id() if sys.platform == "linux" else 0  # elsewhere no thread has a priority
             if mine:
@@ -240,6 +279,8 @@ class WriterThread:
                     self._write_stored(it)
                 case Role.KEYFRAME:
                     self._write_keyframe(it)
+                case Role.SPLIT:
+                    self._write_split(it)
                 case Role.SKIP:
                     self._event(it)
                 case Role.GAP:
@@ -349,6 +390,73 @@ class WriterThread:
                 if type(leaf) is Reference and leaf.content is not None and leaf.numbers is None:
                     leaf.content.digest()
 
+    def _write_split(self, it: Operation) -> None:
+        """Complete the file, and begin the next one with all that is there: it can be read without those before."""
+        assert self._following is not None
+        before = self._sink
+        before.finish({"ended": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), **self._summary()})
+        self._sink, self._finished_bytes = self._following(), self._finished_bytes + before.output.tell()
+        self._sink.continues = True
+        self._since, self._begun_at = {}, it.stamp[0]
+        moved: dict[tuple[Path, int], Reference] = {}
+        file, past = None, None
+        try:
+            with suppress(OSError, DamagedRecording):  # it was moved away at once
+                file = Container(before.path)
+                past = RecordedPast(file, self._ships)
+            for name in list(self._trees):
+                try:
+                    self._continue(name, it.stamp[0], past, moved)
+                except NotWritten:
+                    del self._trees[name]
+                    self._fall_behind(name)
+                except FullError:
+                    del self._trees[name]
+                    self._lose_for_good((name,))
+                self._since[name] = it.stamp[0] if name in it.value["waiting"] else it.value["now"]
+        finally:
+            if file is not None:
+                file.close()
+        self._sink.continues = False
+        self._sink.output.appear()
+        chained = {key: moved[ref.path, ref.at] for key, ref in self._moved.items() if (ref.path, ref.at) in moved}
+        # What stands for a value that was read long ago may be forgotten: the key is read again then.
+        self._moved = moved if len(chained) > _MOST_MOVED else chained | moved
+        self.splitting = False
+
+    def _continue(
+        self, name: str, at: int, past: RecordedPast | None, moved: dict[tuple[Path, int], Reference]
+    ) -> None:
+        """Write what a key holds to the next file, with the messages that it refers to; NotWritten if one is gone."""
+
+        def move(leaf: Any) -> Any:
+            if type(leaf) is not Reference or leaf.label == LOST:
+                return leaf
+            encoded = None
+            with suppress(OSError):
+                encoded = None if past is None else past.encoded(leaf)
+            if encoded is None:
+                raise NotWritten
+            self._count(self._sink.part(leaf.path, Role.PART, Kind.READ, leaf.label, encoded, state.stamp))
+            moved[leaf.path, leaf.at] = replace(leaf, at=at)
+            return moved[leaf.path, leaf.at]
+
+        state = Operation(Role.STATE, (name,), None, (at, 0, 0), Kind.READ)
+        self._trees[name] = mapped(self._trees[name], move)
+        self._trees[name] = self._settled(state, self._trees[name])
+        self._keyframe(state, self._trees[name])
+        give_way()
+
+    def _current(self, leaf: Any) -> Any:
+        """Return what stands for a value in this file, given what did when it was read."""
+        if type(leaf) is not Reference or leaf.at == self._begun_at:
+            return leaf
+        if leaf.at > self._since.get(str(leaf.path[0]), -1):
+            return leaf
+        if (leaf.path, leaf.at) not in self._moved:
+            raise NotWritten
+        return self._moved[leaf.path, leaf.at]
+
     def _settled(self, it: Operation, tree: Any) -> Any:
         """Return a tree with the long lists in it, of which items were updated, as messages of their own again."""
         return tree if tree is MISSING else self._extracted(it._replace(value=tree, kind=Kind.READ))
@@ -391,7 +499,8 @@ class WriterThread:
                 return Reference(LOST, path, it.stamp[0], 0, f"{stored.summary}, not recorded: too many paths")
             return stored
 
-        return extract(it.value, it.path, store)
+        value = extract(it.value, it.path, store)
+        return mapped(value, self._current) if self._since else value
 
     def _packed(self, label: str, value: Any) -> tuple[Any, str]:
         """Return an array or bytes, and the label; None if there is no way to make bytes of the value."""
