@@ -58,8 +58,8 @@ class LocalPath:
         self._pid = os.getpid()
         self._segments: dict[str, Segment] = {}
         self._audiences: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
-        # What is made when first used. Not by functools.cached_property: it has a lock in Python 3.11, which a child that
-        # is forked meanwhile would find taken for good.
+        # What is made when first used. Not by functools.cached_property: it has a lock in Python 3.11, which a child
+        # that is forked meanwhile would find taken for good.
         self._made: dict[str, Any] = {}
 
     @property
