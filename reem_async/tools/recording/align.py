@@ -337,10 +337,10 @@ def stacked(values: list[Any]) -> np.ndarray[Any, Any] | list[Any]:
         forms = {(value.dtype, value.shape) for value in values}
         return np.stack(values) if len(forms) == 1 else values
     if kinds == {list}:
-        lengths = {len(value) for value in values}
+        lengths = set(map(len, values))
         if len(lengths) != 1 or lengths == {0}:
             return values
-        flat = numbers([item for value in values for item in value])
+        flat = numbers(list(itertools.chain.from_iterable(values)))
         return values if flat is None else flat.reshape(len(values), -1)
     flat = numbers(values)
     return values if flat is None else flat

@@ -10,17 +10,19 @@ from __future__ import annotations
 import io
 import struct
 import threading
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Channel, Header, Metadata, Schema
 
 from .format import DamagedRecording
 from .mcap_reader import (
@@ -53,6 +55,20 @@ _BARE_BYTES = 1 << 20
 """Bytes of messages outside of chunks that are read as one chunk."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
 """First and last log time, size and CRC-32 of the content, length of the name of the compression."""
+
+
+class _Own(threading.local):
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+
+
+_OWN = _Own()  # a decompressor is for one thread at a time
+# By the names that files have for them.
+_UNPACK: dict[bytes, Callable[[memoryview, int], bytes]] = {
+    b"": lambda data, _: bytes(data),
+    b"lz4": lambda data, _: bytes(lz4.frame.decompress(data)),
+    b"zstd": lambda data, size: _OWN.zstd.decompress(data, max_output_size=size),
+}
 # What other records of these kinds would hide: all that follows.
 _END_LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
@@ -86,19 +102,16 @@ def _unpacked(source: Source, info: ChunkInfo) -> bytes | None:
         return source.read(info.offset, info.length)
     body = source.read(info.offset + HEAD.size, info.length - HEAD.size)
     try:
-        start, end, size, checksum, length = _CHUNK_HEAD.unpack_from(body)
+        start, _, size, checksum, length = _CHUNK_HEAD.unpack_from(body)
         data = _CHUNK_HEAD.size + length + 8
-        if size > _LARGEST_CHUNK or start != info.start:
-            return None
-        name = body[_CHUNK_HEAD.size : data - 8].decode()
         (packed,) = struct.unpack_from("<Q", body, data - 8)
-        chunk = Chunk(name, body[data : data + packed], end, start, checksum, size)
-        # The checksum is of the unpacked bytes, so damage in what unpacks well is found too.
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        content = stream.read(length)
+        if size > _LARGEST_CHUNK or start != info.start or data + packed > len(body):
+            return None
+        content = _UNPACK[body[_CHUNK_HEAD.size : data - 8]](memoryview(body)[data : data + packed], size)
     except Exception:  # zstandard and lz4 have errors of their own for what is damaged
         return None
-    return content if len(content) == size else None
+    # The checksum is of the unpacked bytes, so damage in what unpacks well is found too; 0 if there is none.
+    return content if len(content) == size and checksum in (0, zlib.crc32(content)) else None
 
 
 def _take_records(content: bytes, contents: Contents) -> Index | None:

@@ -149,15 +149,24 @@ class PathReader:
     def __init__(self, path: Path, *, wrapped: bool) -> None:
         self._path = path
         self._wrapped = wrapped
+        # A step at a time in all messages is quicker. By an index it might lead into a text.
+        is_named = all(isinstance(key, str) for key in path)
+        self._keys = [*([WRAPPER] if wrapped else []), *path] if is_named else []
         self._notes: dict[str, list[Any]] = {}  # those that concern the path, by the text that was at "$ship"
 
     def read(self, texts: list[bytes]) -> list[Any] | None:
         """Return the plain values or short arrays of some messages; None if one has something else, or is damaged."""
-        # Each level takes a bracket.
-        if max(map(len, texts)) >= 2 * _DEEPEST and max(map(_brackets, texts)) > _DEEPEST:
+        together = b"[%b]" % b",".join(texts)
+        # Each level takes a bracket, and so does each message.
+        if _brackets(together) - len(texts) > _DEEPEST and max(map(_brackets, texts)) > _DEEPEST:
             return None
         try:
-            found = [self._value(root) for root in orjson.loads(b"[%b]" % b",".join(texts))]
+            found = orjson.loads(together)
+            if any(NOTES in root for root in found) or not self._keys:
+                found = [self._value(root) for root in found]
+            else:
+                for key in self._keys:
+                    found = [it[key] for it in found]
         except (LookupError, TypeError, ValueError, OverflowError):
             return None
         return found if len(found) == len(texts) else None

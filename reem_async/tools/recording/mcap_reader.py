@@ -40,6 +40,9 @@ _PLACE = np.dtype([("channel", "<u2"), ("offset", "<u8")])
 # The head of a message index: opcode, length, channel, bytes of the pairs (log time, offset) that follow.
 _INDEX_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("size", "<u4")])
 _HEAD_BYTES = np.arange(_INDEX_HEAD.itemsize)
+_PART_HEAD = struct.Struct("<BQHI")  # the same for one record
+_FEW = 32
+"""Channels of a chunk up to which the records of its index are looked through for one of them."""
 _BLOCK = 1 << 20
 """Bytes that are read at once where a file is read from record to record."""
 # What must be listed in a summary. Readers have to ignore records with an opcode that they do not know.
@@ -268,18 +271,20 @@ def index_places(source: Source, info: ChunkInfo) -> Numbers:
 
 def read_part(source: Source, info: ChunkInfo, channel: int) -> tuple[Numbers, Numbers] | None:
     """Return the log times and places of a channel's messages by the index of a chunk; None if it is damaged."""
-    places = np.frombuffer(source.read(info.map, len(info.channels) * _PLACE.itemsize), _PLACE)
-    place = int(places["offset"][places["channel"] == channel][0])
-    if not info.index <= place <= info.index + info.index_length - _INDEX_HEAD.itemsize:
-        return None
-    head = np.frombuffer(source.read(place, _INDEX_HEAD.itemsize), _INDEX_HEAD)[0]
-    size, start = int(head["size"]), place + _INDEX_HEAD.itemsize
-    is_sound = head["opcode"] == Opcode.MESSAGE_INDEX and head["channel"] == channel and head["length"] == size + 6
-    if not is_sound or size % 16 or start + size > info.index + info.index_length:
-        return None
-    pairs = np.frombuffer(source.read(start, size), "<u8").reshape(-1, 2)
-    times, offsets = pairs[:, 0], pairs[:, 1]
-    return (times, offsets) if not len(times) or info.start <= times.min() <= times.max() <= info.end else None
+    text, position = source.read(info.index, info.index_length), 0
+    if len(info.channels) > _FEW:
+        places = np.frombuffer(source.read(info.map, len(info.channels) * _PLACE.itemsize), _PLACE)
+        position = int(places["offset"][places["channel"] == channel][0]) - info.index
+    while 0 <= position <= len(text) - _PART_HEAD.size:
+        opcode, length, number, size = _PART_HEAD.unpack_from(text, position)
+        start = position + _PART_HEAD.size
+        if opcode != Opcode.MESSAGE_INDEX or length != size + 6 or size % 16 or start + size > len(text):
+            return None
+        if number == channel:
+            pairs = np.frombuffer(text, "<u8", size // 8, start).reshape(-1, 2)
+            return pairs[:, 0], pairs[:, 1]
+        position = start + size
+    return None
 
 
 def index_of(channels: Any, times: Any, offsets: Any) -> Index:

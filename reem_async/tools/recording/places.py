@@ -29,26 +29,25 @@ class Batch(NamedTuple):
     offsets: Numbers
 
 
-_HEADS = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("time", "<u8")])
-_HEAD_BYTES = np.arange(_HEADS.itemsize)
-
-
 def messages_in(content: bytes, batch: Batch, channels: Numbers) -> list[bytes] | None:
     """Return the data of messages in the content of their chunk; None if one is not what the index names.
 
     `channels` are those of the batch by the numbers that they have in the content.
     """
-    offsets = batch.offsets.astype(np.int64)
-    if offsets.min() < 0 or offsets.max() + MESSAGE.size > len(content):
-        return None
-    heads = np.frombuffer(content, np.uint8)[offsets[:, None] + _HEAD_BYTES].view(_HEADS).reshape(-1)
-    is_named = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channels)
-    lengths = np.minimum(heads["length"], len(content)).astype(np.int64)
-    ends = offsets + HEAD.size + lengths
-    if not (is_named & (heads["time"] == batch.times) & (ends <= len(content))).all():
-        return None
-    starts = (offsets + MESSAGE.size).tolist()
-    return [content[start:end] for start, end in zip(starts, ends.tolist(), strict=True)]
+    found, unpack, size = [], MESSAGE.unpack_from, len(content)
+    for offset, channel, time in zip(batch.offsets.tolist(), channels.tolist(), batch.times.tolist(), strict=True):
+        start = offset + MESSAGE.size
+        if start > size:
+            return None
+        opcode, length, number, _, at, _ = unpack(content, offset)
+        end = offset + HEAD.size + length
+        if opcode != _MESSAGE or number != channel or at != time or end > size:
+            return None
+        found.append(content[start:end])
+    return found
+
+
+_MESSAGE = int(Opcode.MESSAGE)
 
 
 class Totals(NamedTuple):
@@ -217,14 +216,25 @@ def _joined(
     for channel, part in parts:
         if part is None:
             return None
-        chosen = _between(part[0], after, until)
-        times = part[0][chosen]
-        columns.append((times, np.full(len(times), channel), part[1][chosen]))
+        times, offsets = part
+        if not len(times):
+            continue
+        first, last = int(times[0]), int(times[-1])
+        if (times[1:] <= times[:-1]).any() or first < info.start or last > info.end:
+            return None
+        if first <= after or last > until:
+            chosen = _between(times, after, until)
+            times, offsets = times[chosen], offsets[chosen]
+        columns.append((times, np.full(len(times), channel), offsets))
+    if not columns:
+        return Batch(info, *[np.empty(0, np.uint64)] * 3)
     times, channels, offsets = columns[0] if len(columns) == 1 else map(np.concatenate, zip(*columns, strict=True))
     if len(columns) > 1:
         order = np.argsort(times)
         times, channels, offsets = times[order], channels[order], offsets[order]
-    return None if (times[1:] <= times[:-1]).any() else Batch(info, times, channels, offsets)
+        if (times[1:] <= times[:-1]).any():
+            return None
+    return Batch(info, times, channels, offsets)
 
 
 def _mask(channels: Iterable[int]) -> Numbers:
