@@ -16,9 +16,10 @@ from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: 
 
 from reem import PublishSpace, RedisInterface
 from reem.server import EmbeddedServer
-from reem_async.errors import RemoteError
+from reem_async.errors import BadInput, BadValue, RemoteError
 from reem_async.plan.keys import keys_of
 from reem_async.tools.browser.history import History
+from reem_async.tools.browser.overlays import hints_of, shapes_of
 from reem_async.tools.browser.trees import differing
 
 expect = playwright.expect
@@ -451,6 +452,65 @@ def test_panes_are_moved_by_dragging_and_the_edge_as_well(visit, kvs, key):
     page.reload()
     expect(titles).to_have_text(["a", "b"])
     assert page.locator("#tree-panel").bounding_box()["width"] == pytest.approx(wide, abs=2)
+
+
+@pytest.mark.parametrize(
+    ("hint", "value", "shapes"),
+    [
+        ("det", [1, 2, 3, 4], [([1, 2, 3, 4], "")]),
+        ("xywh det", np.array([[1, 2, 3, 4, 0.5]]), [([1, 2, 4, 6], "0.50")]),
+        ("points det", np.array([[1.0, 2.0], [np.nan, 3.0]]), [([1, 2], "")]),
+        ("cxcywh det", {"boxes": [[5, 5, 4, 2]], "labels": ["cup"], "scores": [0.9]}, [([3, 4, 7, 6], "cup 0.90")]),
+        (
+            "det",
+            [{"x": 1, "y": 2, "w": 3, "h": 4, "label": "ball"}, {"x": 5, "y": 6}],
+            [([1, 2, 4, 6], "ball"), ([5, 6], "")],
+        ),
+        ("det", [], []),
+    ],
+)
+def test_what_an_overlay_names_is_drawn(hint, value, shapes):
+    (parsed,) = hints_of(hint)
+    assert shapes_of(parsed, value) == shapes
+
+
+def test_an_overlay_that_is_none_is_refused():
+    for text in ("", "boxes points det", "boxes xywh cxcywh det", "x" * 600, "a;" * 20, "boxes a..b"):
+        with contextlib.suppress(BadInput):
+            assert hints_of(text) == [], text
+    for value in ("text", 5, {"a": 1}, [[1]], [["x", "y"]], {"box": [1, 2, 3]}, None, b"bytes", [[[{"q": 1}]]]):
+        with pytest.raises(BadValue, match="det"):
+            shapes_of(hints_of("boxes det")[0], value)
+    deep = []
+    for _ in range(100_000):
+        deep = [deep]
+    with pytest.raises(BadValue, match="deep"):
+        shapes_of(hints_of("det")[0], deep)
+
+
+@pytest.mark.long
+def test_boxes_are_drawn_over_a_picture_by_a_hint_that_is_typed_once(visit, pspace, key):
+    pspace[key()] = {"image": np.zeros((40, 60), np.uint8), "boxes": [[10, 10, 30, 30]]}
+    page = visit.open(f"/view/{key()}.image")
+    page.get_by_label("Overlay").fill(f"boxes {key()}.boxes")
+    page.keyboard.press("Enter")
+    inked = """it => {
+        const { width, height } = it, copy = Object.assign(document.createElement("canvas"), { width, height });
+        const context = copy.getContext("2d", { willReadFrequently: true });
+        context.drawImage(it, 0, 0);
+        const at = (x, y) => context.getImageData(Math.round(x * width), Math.round(y * height), 1, 1).data[3] > 0;
+        return [at(10 / 60, 0.5), at(0.5, 0.25), at(20 / 60, 0.5), at(0.9, 0.5)];
+    }"""
+    drawn = page.locator("canvas.overlay")
+    eventually(lambda: drawn.evaluate(inked) == [True, True, False, False] or page.wait_for_timeout(50))
+    page.goto(f"{visit.address}/view/{key()}")
+    expect(drawn).to_have_count(1)
+    expect(drawn).to_be_visible()
+    eventually(lambda: drawn.evaluate(inked)[0] or page.wait_for_timeout(50))
+    page.goto(f"{visit.address}/view/{key()}.image")
+    page.get_by_label("Overlay").fill("nothing.here")
+    page.keyboard.press("Enter")
+    expect(page.locator("#view .card .wrong")).to_contain_text("nothing.here")
 
 
 @pytest.mark.long

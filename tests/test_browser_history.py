@@ -170,6 +170,14 @@ def test_what_is_beside_a_change_is_as_it_was(history):
     assert history.unchanged(("k",), 3.0)
 
 
+def test_a_dict_beside_a_value_that_changes_often_has_the_right_age(history):
+    history.begin("k", b'{"x": 0, "slow": {"a": 1}}')
+    history.add(("k", "slow", "a"), 2, 8, 1.0)
+    for number in range(3000):
+        history.add(("k", "x"), number, 8, 2.0 + number / 1000)
+    assert history.last([("k", "slow"), ("k", "never")], 9.0) == {("k", "slow"): 1.0}
+
+
 def test_series(history):
     history.begin("k", b'{"x": 0, "q": [1, 2]}')
     for when, path, value in ((1, "x", 1.5), (2, "q", [3, 4]), (3, "x", 2.5), (4, "x", "text"), (5, "x", 3)):

@@ -44,6 +44,7 @@ def robot(kvs, key):
 
 
 def test_the_tree_has_types_sizes_and_values(ask, robot):
+    eventually(lambda: ask.rows(robot)["nested"]["size"])  # the sizes of dicts come from what has been read
     rows = ask.rows(robot)
     said = {label: (row["kind"], row["text"], row["size"], row["count"]) for label, row in rows.items()}
     assert said == {
@@ -53,12 +54,12 @@ def test_the_tree_has_types_sizes_and_values(ask, robot):
         "s": ("str", '"hello"', 5, None),
         "b": ("bool", "true", 8, None),
         "none": ("NoneType", "null", 8, None),
-        "q": ("list", "[1, 2.5, 3]", None, 3),
-        "nested": ("list", "", None, 2),
+        "q": ("list", "[1, 2.5, 3]", 24, 3),
+        "nested": ("list", "", 16, 2),
         "image": ("numpy", "uint8[40,60,3]", 7200, None),
         "depth": ("numpy", "float32[2,2]", 16, None),
         "raw": ("bytes", "bytes", 3, None),
-        '["a.b"]': ("dict", "", None, 1),
+        '["a.b"]': ("dict", "", 8, 1),
     }
     assert ask.rows(rows['["a.b"]']["address"])["c d"]["text"] == "5"
     assert ask.rows(rows["nested"]["address"])["[1]"]["address"] == f"{robot}.nested[1]"

@@ -20,6 +20,7 @@ def test_the_tree_opens_closes_and_remembers(visit, kvs, key):
     row(page, name).locator(".twist").click()
     expect(row(page, f"{name}.image")).to_contain_text("uint8[20,30]")
     expect(row(page, f"{name}.image")).to_contain_text("600 B")
+    expect(row(page, name).locator(".size")).to_have_text("624 B")  # of all that is in it
     row(page, f"{name}.arm").locator(".twist").click()
     expect(row(page, f"{name}.arm.q")).to_contain_text("[1.5, 2.5]")
     page.reload()
@@ -285,6 +286,18 @@ def test_writing_asks_first_and_tells_subscribers(visit, pspace, kvs, key):
     expect(page.locator("#confirm")).to_be_hidden()
     area.fill("3")
     expect(page.locator(".wrong")).to_be_hidden()
+    page.get_by_text("Write…").click()
+    page.get_by_role("button", name="Write", exact=True).click()
+    expect(page.locator(".big")).to_have_text("3.0")  # where a float was, there is one
+    area.fill('"three"')
+    for answer in ("Cancel", "Change the type"):
+        page.get_by_text("Write…").click()
+        page.get_by_role("button", name="Write", exact=True).click()
+        expect(page.locator("#confirm-hint")).to_contain_text(f"{name}.kp: float becomes str")
+        value = kvs[name]["kp"].read()
+        assert (value, type(value)) == (3.0, float)
+        page.get_by_role("button", name=answer).click()
+    eventually(lambda: kvs[name]["kp"].read() == "three")
 
 
 @pytest.mark.long
@@ -386,11 +399,22 @@ def test_the_scale_of_colours_is_there_again_after_other_tabs(visit, kvs, key):
 
 
 @pytest.mark.long
-def test_on_a_phone_the_tree_and_the_value_take_turns(visit, kvs, key):
+def test_on_a_phone_the_tree_and_the_value_take_turns(visit, kvs, pspace, key):
     kvs[key("a_rather_long_name_of_a_key")] = {"x": list(range(40)), "text": "word " * 200}
     name = key("a_rather_long_name_of_a_key")
     page = visit.open("/")
     page.set_viewport_size({"width": 360, "height": 640})
+    pspace[key("busy")] = 1.0
+    card = page.locator(f'.pane .pane-head a[title="{key("busy")}"]')
+    for number in range(100):
+        pspace[key("busy")] = float(number % 3)
+        page.wait_for_timeout(30)
+        if card.count():
+            break
+    expect(card).to_be_in_viewport()
+    assert card.bounding_box()["y"] < row(page, name).bounding_box()["y"]
+    page.get_by_role("button", name="Keys", exact=True).click()
+    expect(row(page, name)).to_be_in_viewport()
     row(page, name).click()
     expect(page.locator("nav")).to_be_hidden()
     row(page, f"{name}.text", "#view").click()

@@ -137,10 +137,11 @@ def write(writable):
     with client_of(writable) as client:
         secret = config_of(client.http.get("/").text)["key"]
 
-        def write(path, value, content=None, **headers):
+        def write(path, value, content=None, retype=False, **headers):
             given = {"origin": writable, "x-reem-key": secret, "content-type": "application/json"}
             given |= {name.replace("_", "-"): text for name, text in headers.items()}
-            content = orjson.dumps({"path": path, "value": value}) if content is None else content
+            said = {"path": path, "value": value, "retype": retype}
+            content = orjson.dumps(said) if content is None else content
             return client.http.post("/api/write", content=content, headers=given)
 
         yield write
@@ -153,7 +154,11 @@ def test_what_a_page_writes_is_published(write, robot, kvs, interface):
     update = next(updates)
     assert (update.path, update.data) == ((robot, "n"), 7) or update.data == 7
     updates.close()
-    assert write(f"{robot}.nested[1]", {"a": [1, None, "x"]}).status_code == 200
+    before = kvs[robot]["nested"].read()
+    asked = write(f"{robot}.nested[1]", {"a": [1, None, "x"]})
+    assert asked.json() == {"retyped": [f"{robot}.nested[1].a: int becomes list"]}
+    assert kvs[robot]["nested"].read() == before, "a write that changes a type was not confirmed"
+    assert write(f"{robot}.nested[1]", {"a": [1, None, "x"]}, retype=True).status_code == 200
     assert kvs[robot]["nested"].read() == [{"a": 1}, {"a": [1, None, "x"]}]
     big = write("", None, content=b'{"path":"%s.big","value":9223372036854775807}' % robot.encode())
     assert big.status_code == 200

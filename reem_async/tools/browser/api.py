@@ -280,9 +280,9 @@ class Api:
         """Publish a value, if that is allowed, and asked by a page from here."""
         if not self.allow_write:
             raise RefusedRequest(403, "this page is read-only; start it with: reem browse --allow-write")
-        path, value = await self._asked_by_own_page(request)
-        await self._source.write(path, value)
-        return reply({"written": address(path)})
+        path, value, retype = await self._asked_by_own_page(request)
+        retyped = await self._source.write(path, value, retype=retype)
+        return reply({"retyped": [visible(text) for text in retyped]} if retyped else {"written": address(path)})
 
     async def layouts(self, request: Request) -> Response:
         """Return the layouts in the store, by their names."""
@@ -299,7 +299,7 @@ class Api:
         """Keep a layout in the store, or remove it with null."""
         if not self.allow_write:
             raise RefusedRequest(403, "this page is read-only; start it with: reem browse --allow-write")
-        name, layout = await self._content(request)
+        name, layout, _ = await self._content(request)
         if _LAYOUT_NAME.fullmatch(name) is None:
             raise RefusedRequest(400, f"{name[:60]!r} names no layout; use up to 60 letters, digits, blanks, - and _")
         if layout is not None and (not isinstance(layout, dict) or len(json.dumps(layout)) > _LARGEST_LAYOUT):
@@ -309,21 +309,21 @@ class Api:
 
     async def hint(self, request: Request) -> Response:
         """Note what the bytes of another program are, for this start of the page; nothing is written."""
-        path, text = await self._asked_by_own_page(request)
+        path, text, _ = await self._asked_by_own_page(request)
         if not isinstance(text, str):
             raise RefusedRequest(400, 'the value is text, such as "uint8[480,640,3]"')
         self._source.hint(path, text)
         return reply({"shown as": text})
 
-    async def _asked_by_own_page(self, request: Request) -> tuple[Path, Any]:
-        """Return the path and the value that a page from here sends."""
-        where, value = await self._content(request)
+    async def _asked_by_own_page(self, request: Request) -> tuple[Path, Any, bool]:
+        """Return the path and the value that a page from here sends, and whether the type may change."""
+        where, value, retype = await self._content(request)
         path = path_of(where)
         if not path:
             raise RefusedRequest(400, "a top-level key is needed")
-        return path, value
+        return path, value, retype
 
-    async def _content(self, request: Request) -> tuple[str, Any]:
+    async def _content(self, request: Request) -> tuple[str, Any, bool]:
         if not same_origin(request.headers):
             raise RefusedRequest(403, "this did not come from a page of this program")
         offered = request.headers.get("x-reem-key", "")
@@ -333,7 +333,7 @@ class Api:
         content = await body_of(request)
         if not isinstance(content, dict) or "value" not in content or not isinstance(content.get("path"), str):
             raise RefusedRequest(400, 'send {"path": ..., "value": ...}')
-        return content["path"], content["value"]
+        return content["path"], content["value"], content.get("retype") is True
 
 
 def _control(it: StoredParameter) -> dict[str, Any]:

@@ -13,13 +13,14 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from ...errors import BadType, BadValue
+from ...errors import BadData, BadInput, BadType, BadValue, MissingKey
 from ...plan.paths import show
 from ...plan.placeholders import Unfetched
 from ...ships.images import EncodedImage
 from .api import answered, at_of, integer_of, number_of, reply, told, value_path_in
+from .overlays import hints_of, shapes_of
 from .pictures import LARGEST_SIDE, MAPS, Preview, RenderedPicture, Slice, colours_of, look_at, paint, parse_slice, part
-from .source import NotKept, Sample, Source, finite, shown_text, thinned
+from .source import NotKept, Sample, Source, finite, shown_text, thinned, visible
 
 # Tables, lines and histograms: as much of an array as a screen has room for.
 
@@ -147,7 +148,7 @@ class Arrays:
         self._turns = anyio.CapacityLimiter(1)  # one at a time: numpy would take all processors
 
     def routes(self) -> list[Route]:
-        asked = self.image, self.table, self.line, self.histogram, self.bytes, self.picture, self.colours
+        asked = self.image, self.table, self.line, self.histogram, self.bytes, self.picture, self.colours, self.overlay
         routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         return [*routes, Route("/array", told(self.array), methods=["GET"])]
 
@@ -236,6 +237,17 @@ class Arrays:
         array, said = await self._array(request)
         some = part(array, _slice(request, array, array.ndim))
         return reply({**await self._do(some.nbytes, lambda: histogram(some)), **said})
+
+    async def overlay(self, request: Request) -> Response:
+        """Return the boxes and points that a hint names, each with its label and the number of its part of the hint."""
+        shapes: list[Any] = []
+        try:
+            for part, hint in enumerate(hints_of(request.query_params.get("hint", ""))):
+                value = (await self._source.value(hint.path, at_of(request))).value
+                shapes += [(*shape, part, hint.relative) for shape in shapes_of(hint, value)]
+        except (MissingKey, NotKept, BadData, BadInput) as error:  # to a page that follows keys, that is no error
+            return reply({"shapes": shapes, "wrong": visible(str(error))})
+        return reply({"shapes": shapes, "wrong": ""})
 
     async def bytes(self, request: Request) -> Response:
         """Return the beginning of bytes in hexadecimal, and whether they are a picture."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
@@ -38,10 +39,11 @@ from .source import (
     snippets,
 )
 from .timeline import UNKNOWN
-from .trees import Frame, differing, thawed
+from .trees import Frame, differing, fitted, leaves_size, thawed
 
 _LARGEST = 1 << 28  # bytes of arrays up to which a value is read for a page
 _SHARED_SECONDS = 0.2  # how long one reading of a large value serves all requests
+_SIZE_SECONDS, _MOST_SIZES = 5.0, 1000  # how long the size of a dict is taken for known, and of how many
 _SHORT = 128  # bytes of a value up to which it is read to be drawn
 _UNTOLD = (
     "what is only stored is looked for once a second, and overwritten arrays are not noticed: the server does not tell"
@@ -73,6 +75,7 @@ class LiveSource:
         self._follower = Follower(interface, self.history)
         self._raw = RawFollower(interface.session, self.history)
         self._shared: dict[Path, asyncio.Task[Any]] = {}
+        self._sizes: dict[Path, tuple[float, int | None]] = {}  # of dicts and lists, and when they had it
         self._space: Any = PublishSpace(interface)
 
     async def start(self) -> None:
@@ -151,7 +154,20 @@ class LiveSource:
         rate = self.history.rate(name, when) if len(node.path) == 1 else None
         if raw and at is None and len(node.path) == 1:
             rate = self._raw.rate(name)
-        return replace(node, time=last.get(node.path), rate=rate, raw=raw)
+        size = self._size(node.path, when) if node.size is None and node.count is not None else node.size
+        return replace(node, time=last.get(node.path), rate=rate, raw=raw, size=size)
+
+    def _size(self, path: Path, when: float) -> int | None:
+        """Return the bytes of all that is in a dict or list, as it was a few seconds ago; None if that is not known."""
+        known, size = self._sizes.get(path, (-math.inf, None))
+        if not 0 <= when - known < _SIZE_SECONDS:
+            if len(self._sizes) >= _MOST_SIZES:
+                self._sizes.clear()
+            tree = self.history.tree(path, when)
+            size = leaves_size(tree) if isinstance(tree, dict | list) else None
+            if tree is not UNKNOWN:
+                self._sizes[path] = when, size
+        return size
 
     async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
         """Return some of what is below a path: four round trips at most."""
@@ -266,8 +282,10 @@ class LiveSource:
         else:
             await publish(self.interface.session, (LAYOUTS, name), layout)
 
-    async def write(self, path: Path, value: Any) -> None:
-        """Publish a value in the place of a plain one; subscribers learn of it. Up to five round trips.
+    async def write(self, path: Path, value: Any, *, retype: bool = False) -> list[str]:
+        """Publish a value in the place of a plain one; subscribers learn of it. Up to six round trips.
+
+        Returns what would have another type; nothing is written then unless `retype`.
 
         Raises:
             BadType: An array is there, or nothing at all below the top level.
@@ -279,7 +297,7 @@ class LiveSource:
         found, _ = await stored_parameters(self.interface.session, path)
         if (it := found.get(path)) is not None:
             await publish(self.interface.session, path, it.specification.checked(it.name, value))
-            return
+            return []
         (node,) = await peek(self.interface.session, [path])
         if node is None:
             raise MissingKey(f"nothing is stored at {show(path)}; the page changes only what is there")
@@ -288,8 +306,12 @@ class LiveSource:
         # A dict that holds arrays would lose them: what the page sends is JSON.
         if node.count is not None and _has_leaves(await outline(self.interface, path)):
             raise BadType(f"{show(path)} holds arrays or bytes, which a page cannot write; edit what is below it")
+        value, retyped = fitted(await self._read_new(path), value, path)
+        if retyped and not retype:
+            return retyped
         accessor: Any = reduce(getitem, path, self._space)
         await accessor.write(value)
+        return []
 
     # --- time
 

@@ -266,7 +266,7 @@ class LogSource(Source):
         state = await self._do(lambda: self._state(self._when(at)))
         return await self._do(lambda: matching(text.lower(), sorted(state), state.items(), most))
 
-    async def write(self, path: Path, value: Any) -> None:
+    async def write(self, path: Path, value: Any, *, retype: bool = False) -> list[str]:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")
 
     async def save_layout(self, name: str, layout: dict[str, Any] | None) -> None:

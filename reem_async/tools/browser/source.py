@@ -16,7 +16,7 @@ from ...errors import BadKey, ReemError
 from ...plan.paths import Path, check_top_key, parse, parse_suffix, suffix
 from ...plan.placeholders import Unfetched
 from ...plan.trees import is_addressable, walk
-from .trees import Frame, described
+from .trees import Frame, described, leaves_size
 
 # Paths in URLs and snippets: one text for each path, which leads back to exactly that path.
 
@@ -89,7 +89,7 @@ class Node:
     path: Path  # where, top-level key first
     kind: str  # "dict", "list", "str", "int", "float", "bool", "NoneType", or the label of a ship
     text: str = ""  # what to show of it: the value, shortened, or the summary of an array
-    size: int | None = None  # bytes; None for dicts and lists
+    size: int | None = None  # bytes, of dicts and lists all that is in them; None if that is not known
     count: int | None = None  # how many items a dict or list has; None for anything else
     value: Any = None  # a number, bool or None as it is; else None
     time: float | None = None  # when it was last seen to change, in seconds since 1970; None if that is not known
@@ -127,7 +127,7 @@ class Page:
 def node_of(path: Path, value: Any) -> Node:
     """Return the node of a value, an array or a `Unfetched`."""
     if isinstance(value, dict | list):
-        return Node(path, type(value).__name__, _preview(value), None, len(value))
+        return Node(path, type(value).__name__, _preview(value), leaves_size(value), len(value))
     if isinstance(value, str):
         return Node(path, "str", shown_text(value), len(value.encode(errors="replace")))
     if value is None or isinstance(value, bool | int | float):
@@ -231,7 +231,9 @@ class Source(Protocol):
     async def children(self, path: Path, start: int, count: int, at: float | None) -> Page: ...
     async def value(self, path: Path, at: float | None) -> Sample: ...
     async def search(self, text: str, at: float | None, most: int) -> list[Path]: ...
-    async def write(self, path: Path, value: Any) -> None: ...
+    # Returns what would have another type, in words, and writes nothing then unless `retype`. Whole numbers become
+    # floats where floats are.
+    async def write(self, path: Path, value: Any, *, retype: bool = False) -> list[str]: ...
 
     # Says what the bytes of another program are, such as "uint8[480,640,3]".
     def hint(self, path: Path, text: str) -> None: ...

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from ...errors import BadData
@@ -18,7 +18,8 @@ PENDING: Any = type("Pending", (), {"__repr__": lambda self: "PENDING"})()
 UNKNOWN: Any = type("Unknown", (), {"__repr__": lambda self: "UNKNOWN"})()
 """What a key held before anything is known of it."""
 
-_LOOK_BACK = 2000  # changes looked at to find when a path last changed
+_LOOK_BACK = 2000  # changes looked at to find when a path last changed; after them, the changes of up to so many paths
+_FEW_PATHS = 200
 
 
 class BufferedChange(NamedTuple):
@@ -43,6 +44,10 @@ class ChangeIndex:
     def add(self, path: Path, number: int) -> None:
         """Note a change; its number is larger than all before."""
         self._numbers.setdefault(path, []).append(number)
+
+    @property
+    def paths(self) -> Collection[Path]:
+        return self._numbers.keys()
 
     def drop(self, end: int) -> None:
         # Numbers of changes that are forgotten; a path without any is forgotten too.
@@ -212,6 +217,8 @@ class BufferedPast(Past[int]):
                 wanted.discard(path)
             if not wanted:
                 break
+        if len(self._known.paths) + len(self._pending.paths) <= _FEW_PATHS:  # beside one that changes very often
+            found |= {path: when for path in wanted if (when := self.newest(path, at))}
         return found
 
     def times(self, path: Path) -> list[float]:

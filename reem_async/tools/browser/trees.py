@@ -11,7 +11,7 @@ import numpy as np
 import orjson
 
 from ...errors import BadData
-from ...plan.paths import Path
+from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched, Unreadable, find, marked
 from ...plan.trees import MISSING, get, mapped, walk
 from ...ships.images import EncodedImage
@@ -135,6 +135,43 @@ def weight(tree: Any) -> int:
         else:
             total += 100
     return total
+
+
+_MOST_LEAVES = 5000  # of a tree of which the size is shown
+
+
+def leaves_size(tree: Any) -> int | None:
+    """Return the bytes of all values in a tree, as the rows of each show them; None if there are too many to count."""
+    total = 0
+    for number, (_, it) in enumerate(walk(tree, ())):
+        if number >= _MOST_LEAVES:
+            return None
+        if isinstance(it, str):
+            total += len(it.encode(errors="replace"))
+        elif isinstance(it, _SCALARS):
+            total += 8
+        elif not isinstance(it, dict | list):
+            total += described(it).size
+    return total
+
+
+_MOST_NAMED = 5  # types that change, in one message
+
+
+def fitted(old: Any, new: Any, path: Path) -> tuple[Any, list[str]]:
+    """Return a new value with floats where there were floats, and what has another type than the old one, in words."""
+    if type(old) is float and type(new) is int and float(new) == new:
+        return float(new), []
+    if type(old) is not type(new):
+        return new, [f"{show(path)}: {type(old).__name__} becomes {type(new).__name__}"]
+    retyped: list[str] = []
+    if isinstance(new, dict | list):
+        common = [key for key in new if key in old] if isinstance(new, dict) else range(min(len(old), len(new)))
+        new = copy.copy(new)
+        for key in common:
+            new[key], found = fitted(old[key], new[key], (*path, key))
+            retyped += found
+    return new, retyped[:_MOST_NAMED]
 
 
 # What has another value at one instant than at another.

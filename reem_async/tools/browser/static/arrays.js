@@ -1,5 +1,6 @@
 // Arrays: as an image, as lines, as a table, as a histogram; a part of them where there are more than two axes.
 import { Course } from "./course.js";
+import { Overlay, overlayField } from "./overlay.js";
 import { Histogram, Plot } from "./plot.js";
 import { el, getJson, getPicture, numberEl, setNumbers, setText, swap, toast } from "./util.js";
 
@@ -107,7 +108,7 @@ export class ArrayView {
     const bgr = el("input", { type: "checkbox", checked: options.bgr, onchange: () => { options.bgr = bgr.checked; again(); } });
     this.mapLabel = el("label", {}, "colours ", map);
     this.bgrLabel = el("label", {}, bgr, "BGR");
-    return [this.mapLabel, el("label", {}, "range ", limit("low"), " … ", limit("high")), this.bgrLabel];
+    return [this.mapLabel, el("label", {}, "range ", limit("low"), " … ", limit("high")), this.bgrLabel, overlayField(this.app, this.address)];
   }
 
   // What came with a view: figures of the very array that is shown, and how old it is.
@@ -141,6 +142,8 @@ export class ArrayView {
     this.img.addEventListener("pointermove", (event) => this.point(event));
     this.img.addEventListener("pointerleave", () => { this.pointed = null; setText(this.pixel, NO_PIXEL); });
     this.stage.append(el("div", { class: "picture" }, this.img), this.pixel, this.scaleBox, this.bad);
+    this.overlay = new Overlay(this.img, this.app, this.address);
+    this.pixel.before(this.overlay.wrong);
   }
 
   point(event) {
@@ -187,6 +190,7 @@ export class ArrayView {
     this.img.classList.toggle("small", factor > 2);
     this.img.style.width = `${Math.max(width * factor, 1)}px`;
     this.img.style.height = `${Math.max(height * factor, 1)}px`;
+    await this.overlay.update(said.size, signal);
     const colour = this.slices.image.split(",").filter((word) => word === ":").length === 3 && this.about.shape[this.about.shape.length - 1] > 1;
     this.mapLabel.hidden = colour;
     this.bgrLabel.hidden = !colour;

@@ -1,6 +1,6 @@
 // Numbers over time: one, the few of a small list or vector, or those of several keys; and the time that all plots show.
 import { Plot } from "./plot.js";
-import { el, getJson, toast } from "./util.js";
+import { el, getJson, suggest, toast } from "./util.js";
 
 const MOST_KEYS = 8; // in one plot
 const SETTLED = 150; // ms without another step of zooming until the part that is shown is read
@@ -76,14 +76,8 @@ export class Course {
   get others() { return this.app.layout.plot(this.address).keys ?? []; }
 
   ask() {
-    const names = el("datalist", { id: `keys-of-${this.address}` });
     const box = el("input", { type: "text", placeholder: "another key", title: "Enter adds it, Esc closes", "aria-label": "Key to draw in this plot", spellcheck: false, autocomplete: "off" });
-    box.setAttribute("list", names.id);
-    box.addEventListener("input", async () => {
-      const { found } = await getJson("search", { q: box.value, at: this.app.at });
-      names.replaceChildren(...found.map(({ address }) => el("option", { value: address })));
-    });
-    const form = el("form", { class: "add-key", onsubmit: (event) => { event.preventDefault(); box.blur(); this.add(box.value.trim()); } }, box, names);
+    const form = el("form", { class: "add-key", onsubmit: (event) => { event.preventDefault(); box.blur(); this.add(box.value.trim()); } }, box, suggest(box, this.app));
     box.addEventListener("keydown", (event) => { if (event.key === "Escape") box.blur(); });
     box.addEventListener("blur", () => form.remove());
     this.plot.tools.before(form);

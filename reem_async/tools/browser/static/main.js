@@ -30,6 +30,11 @@ const app = {
     return config.live ? this.span.end - 1 : (this.previous ?? this.span.end);
   },
 
+  sinceText() {
+    if (this.at === null && config.live) return "within 1 s";
+    return this.previous === null ? "" : `since ${clockText(this.since())}`;
+  },
+
   spanFrom(said) {
     const begins = !this.span.end && said.end; // the recording is open now
     this.span = { start: said.start, end: said.end };
@@ -259,6 +264,7 @@ app.time = time;
 
 document.getElementById("badge").hidden = !config.write;
 makeSplitter(document.querySelector("main"), document.getElementById("edge"));
+document.getElementById("to-keys").addEventListener("click", () => document.getElementById("tree-panel").scrollIntoView({ behavior: "smooth" }));
 document.getElementById("help-button").addEventListener("click", () => document.getElementById("help").showModal());
 document.addEventListener("click", (event) => {
   const link = event.target.closest("a[data-go]");

@@ -1,11 +1,13 @@
 // Panes: pictures and plots side by side, of what is in a dict, or of what is busy or pinned.
 import { Course } from "./course.js";
+import { Overlay } from "./overlay.js";
 import { Plot } from "./plot.js";
 import { addressUrl, el, getJson, getPicture, icon, setNumbers, setText, swap } from "./util.js";
 
 export const MOST = 12; // panes at a time
 const PAUSE = 1000; // ms between two looks at a course: a dozen of them cost the program as much as one in full
 const PIN = "M5.5 1.5h5l-.8 4.5 2.3 2.5H8.6V14L8 15l-.6-1V8.5H4l2.3-2.5z";
+const LEAST_PICTURE = 64; // numbers of an array that is worth a picture of its own
 const SHORT = 16; // numbers of a vector that are drawn over time
 
 class Pane {
@@ -71,15 +73,21 @@ class Pane {
       this.picture = el("img", { alt: `Picture of the array at ${this.address}` });
       this.age = el("span", { class: "pane-age" });
       this.body.append(el("a", { class: "picture", href: addressUrl(this.address), "data-go": this.address, draggable: false }, this.picture), this.age);
+      this.overlay = new Overlay(this.picture, this.grid.app, this.address);
+      this.body.append(this.overlay.wrong);
     }
     const { app } = this.grid, map = ["uint8", "bool"].includes(this.about.dtype) ? "grey" : "viridis";
     const { blob, said } = await getPicture("image", { path: this.address, at: app.at, slice: this.about.views.image, map, side: 480 }, signal);
     await swap(this.picture, blob);
+    await this.overlay.update(said.size, signal);
     setText(this.age, said.age > 0.5 ? `from ${said.age.toFixed(1)} s before` : "");
   }
 }
 
-function isPicture(node) { return node.kind === "numpy" && /^\w+\[(\d+, ?)+\d+\]$/.test(node.text); }
+function isPicture(node) {
+  const shape = node.kind === "numpy" && /^\w+\[((?:\d+, ?)+\d+)\]$/.exec(node.text);
+  return Boolean(shape) && shape[1].split(",").reduce((product, size) => product * size, 1) >= LEAST_PICTURE;
+}
 
 export function isNumber(node) { return node.kind === "int" || node.kind === "float"; }
 

@@ -228,7 +228,7 @@ export class Plot {
 
   axes(context, width, height) {
     context.font = `11px ${this.colour("--mono")}`;
-    const rows = rowsOf(this.y0, this.y1, (height - TOP - BOTTOM) / 45, this.log);
+    const rows = rowsOf(this.y0, this.y1, (height - TOP - BOTTOM) / 38, this.log);
     this.left = Math.max(NARROW, ...rows.map(({ text }) => Math.ceil(context.measureText(text).width) + 14));
     const { x, up } = this.place(width, height);
     Object.assign(context, { fillStyle: this.colour("--faint"), textAlign: "right", textBaseline: "middle" });

@@ -1,5 +1,5 @@
 // Time: the slider, the strip of changes above it, playing, stepping, and the clock.
-import { clockText, getJson } from "./util.js";
+import { clockText, el, getJson, setText } from "./util.js";
 
 const FRAME = 100; // ms between frames when playing
 export const STEP = 0.1; // s
@@ -55,6 +55,8 @@ export class TimeBar {
     this.play.setAttribute("aria-label", this.playing ? "Pause" : "Play");
     this.live.setAttribute("aria-pressed", String(!past));
     this.live.disabled = !past && !app.config.live;
+    const since = app.sinceText();
+    setText(document.getElementById("marked"), since && `changed ${since}`);
     this.clock.textContent = this.texts().join("\n");
     this.slider.setAttribute("aria-valuetext", this.texts().join(", "));
   }
@@ -147,7 +149,18 @@ export class TimeBar {
     }
     context.fillStyle = style.getPropertyValue("--soft").trim();
     if (hover !== null) context.fillRect(at(hover), 0, 1, box.height);
-    const [whole, small] = [2, 1].map((kind) => counts.pictures.filter((kept) => kept === kind).length);
-    canvas.title = foot ? `Changes, and below them where arrays are kept: whole in ${whole} of ${counts.pictures.length} parts, small pictures in ${small}` : "Changes";
+    this.explain(Boolean(foot), Boolean(shown), hover);
+  }
+
+  // Below the slider, what the bars are; with the pointer on them, what is there.
+  explain(pictures, zoomed, hover) {
+    const { app, counts } = this, index = hover === null ? -1 : Math.floor(((hover - counts.start) / (counts.end - counts.start)) * counts.counts.length);
+    const kept = ["no array kept", "arrays kept as small pictures", "arrays kept whole"][counts.pictures[index]];
+    const at = counts.counts[index] === undefined ? "" : `${clockText(hover, 1)}: ${counts.counts[index]} changes${kept ? `, ${kept}` : ""}`;
+    const key = `${app.path}|${pictures}|${zoomed}|${at}`;
+    if (this.explained === key) return;
+    this.explained = key;
+    const items = [["change", `changes of ${app.path || "all keys"}`], pictures && ["whole", "arrays kept whole"], pictures && ["small", "as small pictures"], zoomed && ["zoomed", "shown in plots"]];
+    document.getElementById("bars").replaceChildren(...(at ? [at] : items.filter(Boolean).map(([kind, text]) => el("span", {}, el("i", { class: kind }), text))));
   }
 }

@@ -100,9 +100,10 @@ export class Tree {
     setNumbers(parts.value, container ? node.text || `${node.count} ${node.kind === "dict" ? (node.count === 1 ? "key" : "keys") : node.count === 1 ? "item" : "items"}` : node.text);
     parts.value.className = `value is-${node.text.startsWith("[") && container ? "float" : node.kind.replace(/\W/g, "")}`;
     row.classList.toggle("raw", Boolean(node.raw) && this.root === "" && level === 1);
-    parts.key.title = node.raw ? `${node.label}: another program's ${node.raw}` : node.label;
+    const mark = new Map([["changed", "changed"], ["inside", "something in it changed"]]).get(node.mark);
+    parts.key.title = [node.raw ? `${node.label}: another program's ${node.raw}` : node.label, mark && `${mark} ${this.app.sinceText()}`].filter(Boolean).join("\n");
     parts.value.title = `${nameOf(node.kind)}  ${node.text}`;
-    setText(parts.size, container || PLAIN.includes(node.kind) ? "" : bytesText(node.size));
+    setText(parts.size, PLAIN.includes(node.kind) ? "" : bytesText(node.size));
     parts.spark.show(node, this.app.now());
     this.age(parts.age, node);
     return row;
@@ -114,7 +115,7 @@ export class Tree {
     setText(it, node.rate >= 2 ? `${Math.round(node.rate)} Hz` : seconds === null ? "–" : ageText(seconds));
     it.classList.toggle("stale", this.regular.has(node.address) && !node.rate && seconds > 5);
     const changed = seconds === null ? "not seen to change yet" : `changed ${ageText(seconds)}${seconds < 1 ? "" : " ago"}`;
-    it.title = changed;
+    it.title = node.rate >= 2 ? `${node.rate.toFixed(1)} updates per second, ${changed}` : changed;
   }
 
   // A row is used again where the same place is found by a search, there with its whole path.

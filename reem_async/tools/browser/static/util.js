@@ -90,9 +90,9 @@ export async function getPicture(what, values, signal) {
   return { blob: await bodyOf(response, "blob"), said: said ? JSON.parse(said) : null };
 }
 
-export async function postWrite(path, valueText, key, to = "write") {
+export async function postWrite(path, valueText, key, to = "write", retype = false) {
   // The text goes as it is: numbers beyond 2^53 would change in JavaScript.
-  const body = `{"path":${JSON.stringify(path)},"value":${valueText}}`;
+  const body = `{"path":${JSON.stringify(path)},"value":${valueText},"retype":${retype}}`;
   const headers = { "content-type": "application/json", "x-reem-key": key };
   return fetched(`/api/${to}`, { method: "POST", headers, body });
 }
@@ -171,6 +171,18 @@ export function steps(address) {
 export function addressUrl(address) {
   // A single dot or two as a segment would be taken out of the URL by the browser; addresses have none.
   return address ? "/view/" + encodeURIComponent(address).replaceAll("%5B", "[").replaceAll("%5D", "]") : "/";
+}
+
+// A list of keys that a text field offers: those that have the last word in it in their names.
+export function suggest(box, app) {
+  const names = el("datalist", { id: `keys-${(suggest.count = (suggest.count ?? 0) + 1)}` });
+  box.setAttribute("list", names.id);
+  box.addEventListener("input", async () => {
+    const [before, word] = /^(.*?)(\S*)$/.exec(box.value).slice(1);
+    const { found } = await getJson("search", { q: word, at: app.at });
+    names.replaceChildren(...found.map(({ address }) => el("option", { value: before + address })));
+  });
+  return names;
 }
 
 export function toast(text) {

@@ -108,7 +108,7 @@ export class View {
   }
 
   facts(node) {
-    const size = node.kind === "dict" || node.kind === "list" ? `${node.count} ${node.count === 1 ? "item" : "items"}` : bytesText(node.size);
+    const items = node.kind === "dict" || node.kind === "list" ? `${node.count} ${node.count === 1 ? "item" : "items"}` : "", size = [items, bytesText(node.size)].filter(Boolean).join(" · ");
     const age = node.time === null ? "" : ageText(Math.max(this.app.now() - node.time, 0));
     const words = [nameOf(node.kind), node.kind === "numpy" ? node.text : "", SCALARS.includes(node.kind) && node.kind !== "str" ? "" : size];
     if (node.raw) words.push(`another program's ${node.raw}`);
@@ -177,20 +177,28 @@ export class View {
     }
     const before = await this.attempt(() => this.jsonText());
     if (before === undefined) return;
-    const dialog = document.getElementById("confirm");
-    document.getElementById("confirm-path").textContent = visible(this.address);
-    document.getElementById("confirm-old").textContent = before.slice(0, 2000);
-    document.getElementById("confirm-new").textContent = text.slice(0, 2000);
-    dialog.returnValue = "no";
-    dialog.showModal();
-    await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
-    if (dialog.returnValue !== "yes") return;
+    const change = { path: visible(this.address), old: before.slice(0, 2000), new: text.slice(0, 2000) };
+    if (!(await confirmed({ ...change, title: "Write this value?", yes: "Write", hint: "It is published: programs that follow this key learn of it at once." }))) return;
     await this.attempt(async () => {
-      await postWrite(this.address, text, this.app.config.key);
+      const send = async (retype) => bodyOf(await postWrite(this.address, text, this.app.config.key, "write", retype), "json");
+      const { retyped } = await send(false);
+      const hint = `Nothing is written yet. Another type: ${retyped?.join("; ")}. Programs that read it may stop.`;
+      if (retyped && !(await confirmed({ ...change, title: "Change the type?", yes: "Change the type", hint }))) return;
+      if (retyped) await send(true);
       toast("Written");
       this.app.refresh();
     });
   }
+}
+
+// Ask, and return whether the answer is yes.
+async function confirmed(texts) {
+  const dialog = document.getElementById("confirm");
+  for (const [name, text] of Object.entries(texts)) document.getElementById(`confirm-${name}`).textContent = text;
+  dialog.returnValue = "no";
+  dialog.showModal();
+  await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
+  return dialog.returnValue === "yes";
 }
 
 class NumberBody {
