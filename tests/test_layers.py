@@ -130,7 +130,7 @@ ORDER = [
     {"store", "coordination"},
     {"tools.jsontext", "tools.partfile", "tools.snapshots", "tools.recording", "legacy"},
     {"server"},
-    {"tools.browser", "tools.demo"},
+    {"tools.browser", "tools.demo", "tools.viewers"},
     {"tools.cli", "legacy.command", "tools.notebook", "tools.pytest_plugin"},
 ]
 """What may import what: only what stands before it, and its own line. TYPE_CHECKING and functions count too."""

@@ -57,6 +57,8 @@ COMMANDS = (
     Entry("play", "log", "play", LOG, "Publish a recording again, at the recorded pace."),
     Entry("log", "log", "app", LOG, "Look into recordings, and export them."),
     Entry("browse", "browse", "browse", LOG, "Show all keys on a page in the web browser, with a slider for the time."),
+    Entry("foxglove", "viewers", "foxglove", LOG, "Show keys live in Foxglove, or play a recording there."),
+    Entry("rerun", "viewers", "rerun", LOG, "Show keys live in Rerun, or save them for it."),
     Entry("snapshot", "snapshot", "app", LOG, "Save what a server holds to files, list them, restore them."),
 )
 

@@ -325,7 +325,8 @@ def encode(label: str, value: Any, frame: str, time: int) -> EncodedMessage:
     The label is the ship's, or "list"; viewers show `frame`, the path, with a picture; the time is in ns since 1970.
     """
     if isinstance(value, np.ndarray):
-        return _picture(value, frame, time) if _is_picture(label, value) else _array_message(value, time)
+        is_raw = is_picture(label, value.dtype.str, value.shape)
+        return _picture(value, frame, time) if is_raw else _array_message(value, time)
     picture = value.label if isinstance(value, EncodedImage) else picture_format(value) if label == "bytes" else ""
     value = value.data if isinstance(value, EncodedImage) else value
     if picture:
@@ -353,12 +354,12 @@ def _varint(number: int) -> bytes:
     return bytes([*groups, number])
 
 
-def _is_picture(label: str, array: np.ndarray[Any, Any]) -> bool:
+def is_picture(label: str, dtype: str, shape: tuple[int, ...]) -> bool:
     return (
         label == "numpy"
-        and array.ndim in (2, 3)
-        and min(array.shape[:2]) >= _SMALLEST_PICTURE
-        and (array.dtype.str, array.shape[2] if array.ndim == 3 else 1) in _PICTURES
+        and len(shape) in (2, 3)
+        and min(shape[:2]) >= _SMALLEST_PICTURE
+        and (dtype, shape[2] if len(shape) == 3 else 1) in _PICTURES
     )
 
 

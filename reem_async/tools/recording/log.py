@@ -318,6 +318,14 @@ class Log:
         found = [(name, self._tree(name, self._past.changed(name, ns))) for name in self.names()]
         return {name: tree for name, tree in found if tree is not MISSING}
 
+    def states(self, name: str, after: Instant) -> Iterator[tuple[float, Any]]:
+        """Yield the instants after one at which there was news of a top-level key, and all that was at it then.
+
+        Longer arrays are `ArrayHandle`. What was at a deleted key is MISSING.
+        """
+        for ns, tree in self._past.changes((name,), nanoseconds(after)):
+            yield seconds(ns), resolve(tree, self._handle)
+
     def changes(self, after: Instant, until: Instant) -> set[Path]:
         """Return the paths that were updated after one instant and not after another."""
         numbers = self._past.timeline.channels_between(up_to(after), up_to(until))

@@ -1,0 +1,1 @@
+"""What a server or a recording holds, in Foxglove and in Rerun."""
