@@ -59,7 +59,7 @@ STARTS_NOTHING = {"pip", "uv", "uvx", "make"}
 """Commands whose effect is there already; the targets of make have to exist."""
 LIVE = {"echo", "top", "hz", "bw", "delay", "record", "browse"}
 """Commands of reem that go on until Ctrl-C, unless an option says how long."""
-NEEDS = {"zmq": "pyzmq"}
+NEEDS = {"foxglove": "foxglove-sdk", "zmq": "pyzmq"}
 
 
 def title(path):
@@ -225,7 +225,10 @@ FIRST = ROOT / "README.md"
 def test_a_page_is_followed_word_for_word(path, port, tmp_path):
     blocks = fenced(path)
     for module, package in NEEDS.items():
-        if any(f"import {module}" in text for _, text in blocks) and importlib.util.find_spec(module) is None:
+        if (
+            any(f"{word} {module}" in text for word in ("import", "reem") for _, text in blocks)
+            and importlib.util.find_spec(module) is None
+        ):
             pytest.skip(f"needs {package}")
     reader = Reader(tmp_path, port)
     if names := list(reader.redis.scan_iter(count=1000)):

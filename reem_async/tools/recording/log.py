@@ -323,7 +323,7 @@ class Log:
 
         Longer arrays are `ArrayHandle`. What was at a deleted key is MISSING.
         """
-        for ns, tree in self._past.changes((name,), nanoseconds(after)):
+        for ns, tree in self._past.changes((name,), up_to(after)):
             yield seconds(ns), resolve(tree, self._handle)
 
     def changes(self, after: Instant, until: Instant) -> set[Path]:
