@@ -594,6 +594,13 @@ def test_the_table_of_types_in_the_documentation_is_what_a_server_does(kvs, key)
     assert page == typetable.written(page, typetable.table(kvs, key()))
 
 
+def test_an_object_that_contains_itself_is_refused(kvs, key):
+    circular = Node(1)
+    circular.next = circular
+    with pytest.raises(reem.TooDeep, match="nested too deeply, or an object contains itself"):
+        kvs[key()].of(Node).write(circular)
+
+
 PROGRAM = """
     import dataclasses
     from typing import assert_type

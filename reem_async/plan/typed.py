@@ -20,7 +20,7 @@ from typing import Annotated, Any, Final, Literal, NewType, TypeVar, Union, get_
 
 import numpy as np
 
-from ..errors import BadData, BadType, BadValue
+from ..errors import BadData, BadType, BadValue, TooDeep
 from .classes import (
     WHERE_TO_DEFINE,
     Field,
@@ -65,11 +65,13 @@ class Mismatch(Exception):
 
 
 def stored(annotation: Any, value: Any, path: Path) -> Any:
-    """Return what to store of an object. Raises BadValue, which names path, expected and found, or BadType."""
+    """Return what to store of an object. Raises BadValue, which names path, expected and found, BadType or TooDeep."""
     try:
         return _convert(annotation, value, path, _Direction.WRITE)
     except Mismatch as error:
         raise BadValue(str(error)) from None
+    except RecursionError:
+        raise TooDeep(f"{show(path)}: nested too deeply, or an object contains itself") from None
 
 
 def made(annotation: Any, value: Any, path: Path) -> Any:
@@ -196,6 +198,7 @@ _SETS: dict[Any, Any] = {
     collections.abc.Set: set,
     collections.abc.MutableSet: set,
 }
+_ITEMS = {**_LISTS, **_SETS, tuple: tuple}
 
 
 def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
@@ -237,7 +240,7 @@ def _container(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
             raise BadType(f"{show(path)}: the keys of a dict are str, not {_name(keys)}; use dict[str, ...]")
         return {key: _convert(values, it, (*path, key), way) for key, it in _checked(value, Mapping, path).items()}
     named, is_set = _named_items(kind), kind in _SETS
-    if not (kind in _LISTS or kind is tuple or is_set or named):
+    if not (kind in _ITEMS or named):
         raise BadType(
             f"{show(path)}: {_name(annotation)} cannot be the type of what is stored; use dataclasses, msgspec.Struct, "
             "pydantic.BaseModel, NamedTuple, dict[str, ...], list, tuple, set, numpy arrays, numbers, text, bytes, "
@@ -254,7 +257,7 @@ def _container(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
     if way is _WRITE:
         return converted
     try:
-        return kind(*converted) if named else {**_LISTS, **_SETS, tuple: tuple}[kind](converted)
+        return kind(*converted) if named else _ITEMS[kind](converted)
     except TypeError:  # in a set
         raise Mismatch(path, f"{_name(annotation)}, whose items have to be hashable", value) from None
 
