@@ -27,6 +27,7 @@ SIZES = {"state": (200, 0.004), "scan": (200, 0.004), "image": (60, 0.02), "fram
 """Messages, and seconds between two of them, with one subscriber; fewer and longer ones with more."""
 HERTZ = {"command": 100.0, "camera": 30.0, "loop": 1000.0}
 SETTLED = 1.0  # seconds from the start of all programs to the first cycle
+DRAWN = 3.0  # the same beside programs that import or compile for long first
 STARTED = 20.0  # seconds within which a viewer must accept connections
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 
@@ -68,16 +69,20 @@ _FLOOR = {"datagram": Way("datagram", camera=False)}  # without load
 LOOP = {name: Way(name, "subscriber") for name in HOST if name not in ("iceoryx2", "datagram")} | _FLOOR
 VIEWERS = {
     "no viewer": Way("reem-local"),
+    "reem browse": Way("reem-local", "browse"),
     "page": Way("reem-local", "page"),
     "page in Chromium": Way("reem-local", "chromium"),
+    "reem foxglove": Way("reem-local", "bridge"),
+    "reem rerun": Way("reem-local", "entities"),
     **{viewer: Way(viewer, viewer) for viewer in SHOWN},
     **_FLOOR,
 }
-"""REEM's loop with each viewer. `workers/viewer.py` receives what the page and foxglove send, as on another computer.
-The data for rerun goes to the server of its viewer. None of these draws; Chromium draws the page on this computer."""
+"""REEM's loop with each viewer. "rerun" and "foxglove" log from the loop itself. `workers/viewer.py` receives what the
+page and foxglove send, as on another computer. The data for rerun goes to the server of its viewer. None of these
+draws; Chromium draws the page on this computer. "reem browse" runs without a page."""
 
 _VIEWER = [sys.executable, "-m", "benchmarks.workers.viewer"]
-_BROWSE = [sys.executable, "-c", "from reem_async.tools.cli import main; main()", "browse", "--no-open"]
+_REEM = [sys.executable, "-c", "from reem_async.tools.cli import main; main()"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +102,7 @@ class ControlLoopCase(Case):
         for number in range(rounds):
             for name in rotated(list(cycles), number):
                 try:
-                    reply = self._turn(bench, self.ways[name], periods)
+                    reply = turn(bench, self.ways[name], periods)
                     cycles[name] += reply["cycles"]
                     missed[name] += reply["missed"]
                 except ContenderError as error:
@@ -106,31 +111,33 @@ class ControlLoopCase(Case):
         for name, taken in cycles.items():
             yield self.identifier, name, summary(taken, missed=missed[name], periods=periods * rounds)
 
-    def _turn(self, bench: Bench, way: Way, periods: int) -> dict[str, list[float] | int]:
-        port, command, state, camera = free_port(), fresh_key(), fresh_key(), fresh_key()
-        with contextlib.ExitStack() as stack:
 
-            def started(hub: bool = False) -> Worker:
-                worker = bench.workers.start(way.contender, port, hub)
-                stack.callback(worker.end)
-                return worker
+def turn(bench: Bench, way: Way, periods: int) -> dict[str, list[float] | int]:
+    """Start the programs of one way, and return the seconds of each cycle and how many missed their deadline."""
+    port, command, state, camera = free_port(), fresh_key(), fresh_key(), fresh_key()
+    with contextlib.ExitStack() as stack:
 
-            viewer = stack.enter_context(Viewer(bench.workers, way.looks, port, camera))
-            loop = started(hub=True)
-            loop.ask("prepare_control", command=command, state=state)
-            started().ask("stream", channel=command, payload="state", rate=HERTZ["command"])
-            if way.camera:
-                started().ask("stream", channel=camera, payload="image", rate=HERTZ["camera"])
-            if way.looks == "subscriber":
-                subscriber = started()
-                subscriber.ask("listen", channel=camera, payload="image")
-                subscriber.ask("listen", channel=state, payload="state")
-            time.sleep(SETTLED)
-            if way.looks == "subscriber" and not subscriber.ask("heard"):  # the state comes later
-                raise ContenderError("the program that looks had no picture")
-            reply = loop.ask("control", periods=periods, rate=HERTZ["loop"])
-            viewer.check()
-            return reply
+        def started(hub: bool = False) -> Worker:
+            worker = bench.workers.start(way.contender, port, hub)
+            stack.callback(worker.end)
+            return worker
+
+        viewer = stack.enter_context(Viewer(bench.workers, way.looks, port, camera))
+        loop = started(hub=True)
+        loop.ask("prepare_control", command=command, state=state)
+        started().ask("stream", channel=command, payload="state", rate=HERTZ["command"])
+        if way.camera:
+            started().ask("stream", channel=camera, payload="image", rate=HERTZ["camera"])
+        if way.looks == "subscriber":
+            subscriber = started()
+            subscriber.ask("listen", channel=camera, payload="image")
+            subscriber.ask("listen", channel=state, payload="state")
+        time.sleep(DRAWN if way.looks in ("chromium", "entities") else SETTLED)
+        if way.looks == "subscriber" and not subscriber.ask("heard"):  # the state comes later
+            raise ContenderError("the program that looks had no picture")
+        reply = loop.ask("control", periods=periods, rate=HERTZ["loop"])
+        viewer.check()
+        return reply
 
 
 class Viewer:
@@ -138,12 +145,14 @@ class Viewer:
 
     def __init__(self, workers: Workers, kind: str, port: int, camera: str) -> None:
         url, address = workers.server.url, f"http://127.0.0.1:{port}/"
-        browse = [*_BROWSE, "--url", url, "--port", str(port)]
+        browse, free = [*_REEM, "browse", "--no-open", "--url", url, "--port", str(port)], ["--port", str(port)]
         self.serving: list[str] = []  # accepts connections before the other starts
         self.looking: list[str] = []
         self.running: list[subprocess.Popen[bytes]] = []
         self.port, self.profile = port, f"{workers.folder}/chromium-{port}"
-        if kind == "page":
+        if kind == "browse":
+            self.serving = browse
+        elif kind == "page":
             self.serving, self.looking = browse, [*_VIEWER, "page", address, camera]
         elif kind == "chromium":
             chromium = next(filter(None, map(shutil.which, CHROMIUM)), None)
@@ -151,9 +160,14 @@ class Viewer:
                 raise ContenderError("Chromium is not installed")
             options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
             self.serving, self.looking = browse, [chromium, *options, f"--user-data-dir={self.profile}", address]
-        elif kind == "rerun":
+        elif kind in ("rerun", "entities"):
             rerun = str(pathlib.Path(sys.executable).with_name("rerun"))
-            self.serving = [rerun, "--serve-grpc", "--port", str(port), "--memory-limit", "1GB"]
+            self.serving = [rerun, "--serve-grpc", *free, "--memory-limit", "1GB"]
+            if kind == "entities":
+                self.looking = [*_REEM, "rerun", "--url", url, "--connect", f"rerun+http://127.0.0.1:{port}/proxy"]
+        elif kind == "bridge":
+            self.serving = [*_REEM, "foxglove", "--url", url, *free]
+            self.looking = [*_VIEWER, "bridge", str(port)]
         elif kind == "foxglove":
             self.looking = [*_VIEWER, "foxglove", f"{workers.folder}/foxglove-{port}"]
 

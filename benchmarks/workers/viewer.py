@@ -1,4 +1,7 @@
-"""What a person's viewer asks of a robot: `python -m benchmarks.workers.viewer page ADDRESS CAMERA | foxglove FOLDER`.
+"""What a person's viewer asks of a robot: `python -m benchmarks.workers.viewer page|foxglove|bridge ...`.
+
+`page ADDRESS CAMERA` takes what REEM's page does, `foxglove FOLDER` what the servers named in a folder send, and
+`bridge PORT` what `reem foxglove` sends.
 
 It stands for a viewer on another computer: it takes what a viewer takes, and draws nothing. The first picture that it
 has is reported by a line on stdout. It goes on until it is killed.
@@ -47,6 +50,13 @@ def foxglove(folder: str) -> None:
         time.sleep(0.1)
 
 
+def bridge(port: str) -> None:
+    """Subscribe to all channels of one server."""
+    from websockets.sync.client import connect
+
+    take_all(connect, port)
+
+
 def take_all(connect: Callable[..., Any], port: str) -> None:
     """Receive all messages of one server."""
     address = f"ws://127.0.0.1:{port}"
@@ -71,4 +81,4 @@ def report() -> None:
 
 
 if __name__ == "__main__":
-    {"page": page, "foxglove": foxglove}[sys.argv[1]](*sys.argv[2:])
+    {"page": page, "foxglove": foxglove, "bridge": bridge}[sys.argv[1]](*sys.argv[2:])
