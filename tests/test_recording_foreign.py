@@ -438,3 +438,20 @@ async def test_files_of_reem_and_of_others(ros, ainterface, key, tmp_path):
         assert plain(log["arm/state"].at(log.end)) == state(9)
         assert log.metadata["host"] == own.metadata["host"]
         assert {each.role for each in log.channels()} > {"update", "keyframe"}
+
+
+def test_times_of_centuries_ahead(tmp_path):
+    """They are counted as damaged, and the others are read; a publisher's clock may say anything."""
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start()
+        channel = writer.register_channel("/x", "json", 0)
+        for log_time, published in ((BEGIN, 2**64 - 1), (BEGIN + 10**9, 5), (2**64 - 2, 6)):
+            writer.add_message(channel, log_time, b"1", published)
+        writer.finish()
+    with open_log(path) as log:
+        assert log.damaged == 1
+        assert log["x"].history(clock="publisher")[0].tolist() == [(2**64 - 1) / 1e9, 5e-9]
+        assert [update.value for update in log.updates()] == [1, 1]
+        assert log.tree_at(log.end) == {"x": 1}

@@ -27,7 +27,7 @@ from .joined import open_files
 from .log_reader import RecordedPast, RecordedStream
 from .places import Totals
 from .stored import LOST, Reference, pruned, resolve
-from .times import Instant, before, nanoseconds, seconds, up_to
+from .times import LATEST, Instant, before, nanoseconds, seconds, up_to
 
 # Whole keys as they were at some instant: a slider, or a walk through time, asks for neighbours again and
 # again.
@@ -206,7 +206,8 @@ class Log:
     @property
     def end(self) -> float:
         """The instant of the last message; 0 if there is none."""
-        return seconds(max((info.end for info in self._container.chunks), default=0))
+        ends = [info.end if info.end < LATEST else info.start for info in self._container.chunks if info.start < LATEST]
+        return seconds(max(ends, default=0))
 
     @property
     def duration(self) -> float:
@@ -567,7 +568,7 @@ class LogPath:
         for instants, found in self._read(start, end, clock):
             times += instants
             values += found
-        return np.array(times, np.int64).astype(np.float64) / 1e9, stacked(values)
+        return np.array(times, np.float64) / 1e9, stacked(values)
 
     def values(
         self, start: Instant | None = None, end: Instant | None = None, *, clock: RecordedClock = "recorder"

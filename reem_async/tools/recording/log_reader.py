@@ -26,6 +26,7 @@ from .layout import EncodedMessage, PathReader, decode, from_json
 from .places import Timeline, messages_in
 from .sink import CHANNELS
 from .stored import LOST, Reference, applied, opened, reference_to
+from .times import LATEST
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 others |= channels
                 if not channels:
                     raise DamagedRecording(f"{file.path} is an MCAP file without a channel: it holds nothing")
+                file.damaged += any(info.end >= LATEST for info in file.every_chunk)  # a time of centuries ahead
                 continue
             file.damaged += _missing(file, is_described)
             for number, place in places.items():

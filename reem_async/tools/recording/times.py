@@ -23,6 +23,8 @@ PATIENCE = 0.01
 HURRIED = 0.002
 """The same, once large updates were seen to come fast: each is to be fetched before the next one replaces it."""
 
+LATEST = 9 * 10**18
+"""Nanoseconds since 1970 up to which there are instants: the year 2255."""
 # Nanoseconds: what readers of MCAP that use signed numbers can take.
 _LATEST = 2**63 - 1
 # Whose clocks are compared with that of this machine.
@@ -41,7 +43,7 @@ def nanoseconds(instant: Any) -> int:
     if isinstance(instant, bool) or not isinstance(instant, int | float | np.integer | np.floating):
         raise BadType(f"an instant is a float, in seconds since 1970, or a numpy datetime64, not {shorten(instant)}")
     since = float(instant)
-    if not math.isfinite(since) or abs(since) > 9e9:
+    if not math.isfinite(since) or abs(since) > LATEST / 1e9:
         raise BadValue(f"the instant {instant!r} is out of range; give seconds since 1970")
     return _rounded(since)
 
