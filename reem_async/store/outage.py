@@ -17,6 +17,7 @@ import collections
 import logging
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -168,8 +169,9 @@ class Outage:
         """Reset the state, also in a forked child: the parent sends the kept updates."""
         self._out: dict[str, UnsentUpdates] = {}  # by document
         self._dropped: dict[str, int] = {}  # likewise; counted in a key's turn, so threads lose no count
-        self._is_closed = False
+        self._is_closed = self._is_outage = False
         self._dropped_before = 0  # how many were dropped when the last outage began
+        self._reached: object = None  # where the server has answered: the process and the event loop, if any
         # The task that asks whether the server is back; True for a thread of the blocking front.
         self._asking: asyncio.Task[Any] | bool = False
         self._away = False  # the server did not answer the last call or question
@@ -228,12 +230,9 @@ class Outage:
         self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: CallTime, error: ReemError
     ) -> None:
         """Note that a key is out of reach, and apply the policy to the updates of this call."""
-        is_first = not self._out
         self._away = True
         self._out.setdefault(writer.keys.document, UnsentUpdates(writer))
-        if is_first:  # noted before it is logged: a log handler may publish too
-            self._dropped_before = self.dropped
-            self._note_begin(error)
+        self._note_outage(error, self.dropped)
         if isinstance(error, ConnectionLost):  # it was applied or not: sent again, it could be applied twice
             self._count(writer.keys, len(assignments))
         else:
@@ -241,9 +240,17 @@ class Outage:
             self._take(writer, assignments, called)
         self._start_asking()
 
-    def _note_begin(self, error: Exception) -> None:
+    def _note_outage(self, error: Exception, dropped: int) -> None:
+        if self._is_outage:
+            return
+        self._is_outage, self._dropped_before = True, dropped  # first: a log handler may publish too
         what = "kept, the newest of each place," if self.policy == "newest" else "dropped"
         logger.warning("updates are %s until the server is back: %s", what, error)
+
+    def _note_end(self) -> None:
+        if self._is_outage and not self._is_closed:
+            self._is_outage = False
+            logger.warning("the server answers again; %d updates were dropped", self.dropped - self._dropped_before)
 
     def _take(self, writer: DocumentWriter, assignments: Sequence[Assignment], called: CallTime) -> None:
         out = self._out.setdefault(writer.keys.document, UnsentUpdates(writer))
@@ -304,28 +311,31 @@ class Outage:
                 self._asking = False
         if self._out:  # added by a call just now
             self._start_asking()
-        if not self._out and not self._is_closed:
+        else:
             self._note_end()
 
     def _has_more(self) -> bool:
         """Return whether to go on though nothing is kept."""
         return False
 
-    def _note_end(self) -> None:
-        logger.warning("the server answers again; %d updates were dropped", self.dropped - self._dropped_before)
-
     async def _all_sent(self) -> bool:
         """Send the kept updates of each key; return whether all were stored."""
-        every = True
+        before, every = self.dropped, True
         for out in list(self._out.values()):
             if not (await self._answers(out) and await self._sent(out)):
                 every = False
                 if not self._session.transport.sharded:
                     break
+        if not every:
+            self._note_outage(self._reason, before)
+        else:
+            self._note_end()
         return every
 
     async def _answers(self, out: UnsentUpdates) -> bool:
         """Ask the server of a key whether it is back; not in the key's turn, for which callers would wait."""
+        if not out.away:
+            return True
         try:
             await self._session.run(exists(out.writer.keys))
         except InterfaceClosed:
@@ -334,7 +344,10 @@ class Outage:
             self._away, self._reason = isinstance(error, _AWAY), error
         else:
             self._away = False
-        return not self._away
+        out.away = self._away
+        if not out.away:
+            self._reached = self._session.tasks.place
+        return not out.away
 
     async def _sent(self, out: UnsentUpdates) -> bool:
         try:
@@ -346,13 +359,21 @@ class Outage:
 
     async def _flush(self, turn: Turn, out: UnsentUpdates) -> None:
         """Send the kept updates of a key, in its turn. If that is interrupted, the rest stays."""
-        while await self._send_next(turn, out):
+        last = out.last  # not those that come meanwhile: others wait for this turn
+        while out.done < last and await self._send_next(turn, out):
             pass
-        self._out.pop(out.writer.keys.document, None)
+        async with self._calls(out.writer.keys):
+            if not out.kept:
+                self._out.pop(out.writer.keys.document, None)
+
+    def _calls(self, keys: Keys) -> AbstractAsyncContextManager[None]:
+        """Return the lock for putting and taking updates of a key; nothing inside waits."""
+        return self._session.transport.ordered(f"{keys.channel} queue")
 
     async def _send_next(self, turn: Turn, out: UnsentUpdates) -> bool:
         """Send the oldest kept call of a key, in its turn, and those that share its transaction; False for none."""
-        taken = await self._taken(out)  # first, so that none is ever sent twice
+        async with self._calls(out.writer.keys):  # not before the call has shared it with subscribers on this host
+            taken = out.take()  # first, so that none is ever sent twice
         if not taken:
             return False
         keys, calls = out.writer.keys, [it for _, it in taken]
@@ -382,9 +403,6 @@ class Outage:
             out.sending = 0
             turn.release()
         return True
-
-    async def _taken(self, out: UnsentUpdates) -> list[tuple[int, Kept]]:
-        return out.take()
 
     def _not_stored(self, keys: Keys, it: Kept, error: BaseException, is_refused: bool) -> None:
         if isinstance(error, MissingKey):  # a deletion of a value that is gone

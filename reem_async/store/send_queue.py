@@ -23,13 +23,12 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractAsyncContextManager
 from typing import Any
 
 from ..errors import BadType, BadValue, ConnectionLost, InterfaceClosed, Misuse, TlsRefused
 from ..plan.keys import Keys
 from ..session import PublisherIdentity, Session
-from .document import Assignment, CallTime, DocumentWriter, Turn
+from .document import Assignment, CallTime, DocumentWriter
 from .outage import Kept, Outage, UnsentUpdates, own_copies, place_of, size_of
 
 logger = logging.getLogger("reem.publish")
@@ -98,8 +97,6 @@ class SendQueue(Outage):
         self._is_idle = False  # the sender's thread waits for `_wakeups`, or is about to
         self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._is_exit = False  # the program ends: calls send by themselves
-        self._is_outage = False
-        self._reached: object = None  # where the server has answered: the process and the event loop, if any
 
     @property
     def dropped(self) -> int:
@@ -118,10 +115,6 @@ class SendQueue(Outage):
             for it, announcement in zip(own, announcements, strict=True):
                 await announcement.share_early(it.path)
         await self._wake()
-
-    def _calls(self, keys: Keys) -> AbstractAsyncContextManager[None]:
-        """Return the lock for putting updates of a key; nothing inside waits."""
-        return self._session.transport.ordered(f"{keys.channel} queue")
 
     def _numbered(self, writer: DocumentWriter, assignments: Sequence[Assignment], called: CallTime) -> tuple[Any, ...]:
         turn = writer.turn(self._identity)
@@ -188,19 +181,9 @@ class SendQueue(Outage):
             self._is_idle = False
         return True
 
-    def _note_end(self) -> None:
-        """Do nothing: what is queued was sent, in no outage."""
-
     async def _all_sent(self) -> bool:
-        before = self.dropped
         every = await super()._all_sent()
-        if every and self._is_outage:
-            self._is_outage = False
-            super()._note_end()
-        elif not every:
-            if not self._is_outage:
-                self._is_outage, self._dropped_before = True, before
-                self._note_begin(self._reason)
+        if not every:
             self._drop_for_outage()
         self._report()
         return every
@@ -216,27 +199,6 @@ class SendQueue(Outage):
                 dropped.append(out.writer.name)
         if dropped and (self.policy == "raise" or is_final):
             self._errors.append((dropped[0], self._reason))
-
-    async def _answers(self, out: UnsentUpdates) -> bool:
-        if out.away:
-            out.away = not await super()._answers(out)
-            if not out.away:
-                self._reached = self._session.tasks.place
-        return not out.away
-
-    async def _flush(self, turn: Turn, out: UnsentUpdates) -> None:
-        last = out.last
-        while out.done < last and await self._send_next(
-            turn, out
-        ):  # not those that come meanwhile: others wait for this turn
-            pass
-        async with self._calls(out.writer.keys):
-            if not out.kept:
-                self._out.pop(out.writer.keys.document, None)
-
-    async def _taken(self, out: UnsentUpdates) -> list[tuple[int, Kept]]:
-        async with self._calls(out.writer.keys):  # not before the call has shared it with subscribers on this host
-            return out.take()
 
     def _not_stored(self, keys: Keys, it: Kept, error: BaseException, is_refused: bool) -> None:
         self._count(keys, len(it.assignments))
