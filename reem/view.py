@@ -81,7 +81,14 @@ class ViewWatch(Following, Generic[T]):
     def __init__(self, watch: Watch, view: core.View[T]) -> None:
         self._watch = watch
         self._view = view
-        self.listen, self.close = watch.listen, watch.close
+
+    def listen(self) -> None:
+        """Begin to follow."""
+        self._watch.listen()
+
+    def close(self) -> None:
+        """Stop following."""
+        self._watch.close()
 
     @property
     def dropped(self) -> int:
@@ -106,7 +113,14 @@ class ViewMirror(Following, Generic[T]):
     def __init__(self, mirror: Mirror, view: core.View[T]) -> None:
         self._mirror = mirror
         self._view = view
-        self.listen, self.close = mirror.listen, mirror.close
+
+    def listen(self) -> None:
+        """Begin to follow."""
+        self._mirror.listen()
+
+    def close(self) -> None:
+        """Stop following."""
+        self._mirror.close()
 
     @property
     def age(self) -> float:

@@ -14,8 +14,9 @@ from reem._twin import for_plain_code
 
 CLASSES = [
     "RedisInterface", "KeyValueStore", "PublishSpace", "SilentSubscriber", "CallbackSubscriber",
-    "Parameter", "Writer", "Reader", "Publisher", "accessor", "watch", "mirror",
+    "Parameter", "Writer", "Reader", "Publisher", "accessor", "watch", "mirror", "view", "view_watch", "view_mirror",
 ]  # fmt: skip
+MADE = ("accessor", "watch", "mirror", "view", "view_watch", "view_mirror")
 
 SYNTAX = {
     "__aenter__": {"__enter__"},
@@ -40,10 +41,13 @@ ONLY_BLOCKING = {
 
 
 def made(package, name):
-    if name not in ("accessor", "watch", "mirror"):
+    if name not in MADE:
         return getattr(package, name)
-    accessor = package.KeyValueStore(package.RedisInterface("localhost"))["foo"]
-    return type(accessor if name == "accessor" else getattr(accessor, name)())
+    place = package.KeyValueStore(package.RedisInterface("localhost"))["foo"]
+    of, _, method = name.rpartition("_")
+    if "view" in (of, method):
+        place = place.of(int)
+    return type(place if method in ("accessor", "view") else getattr(place, method)())
 
 
 def public(kind):
@@ -99,7 +103,7 @@ def test_every_method_has_its_twin(name):
 @pytest.mark.parametrize("name", CLASSES)
 def test_twins_take_the_same_parameters(name):
     blocking, core = made(reem, name), made(reem_async, name)
-    if name not in ("Parameter", "accessor", "watch", "mirror"):
+    if name not in ("Parameter", *MADE):
         assert parameters(blocking.__init__) == parameters(core.__init__)
     for method in public(core).keys() & public(blocking).keys():
         ours, theirs = getattr(blocking, method), getattr(core, method)
