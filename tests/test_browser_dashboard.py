@@ -19,6 +19,7 @@ from reem.server import EmbeddedServer
 from reem_async.errors import BadInput, BadValue, RemoteError
 from reem_async.plan.keys import keys_of
 from reem_async.tools.browser.history import History
+from reem_async.tools.browser.logsource import LogSource
 from reem_async.tools.browser.overlays import hints_of, shapes_of
 from reem_async.tools.browser.trees import differing
 
@@ -204,7 +205,7 @@ def test_a_plot_has_a_gap_where_updates_were_lost_and_dots_where_none_came(visit
 
 
 @pytest.mark.long
-def test_plots_zoom_together_share_a_cursor_and_take_other_keys(visit, pspace, key):
+def test_plots_zoom_together_share_a_cursor_and_take_other_keys(visit, address, pspace, key, tmp_path):
     for number in range(25):
         pspace[key()] = {"x": float(number), "y": number - 12.0}
         time.sleep(0.03)
@@ -249,6 +250,25 @@ def test_plots_zoom_together_share_a_cursor_and_take_other_keys(visit, pspace, k
     page.keyboard.press("0")
     page.get_by_role("button", name=f"Take {key()}.x out of this plot").click()
     expect(lines).to_have_count(0)
+
+    with client_of(address) as ask:
+        (tmp_path / "run.mcap").write_bytes(ask.http.get("/api/recording").content)
+    with served(lambda: LogSource(tmp_path / "run.mcap")) as (recorded, _):
+        page = visit.open(f"/view/{key()}", address=recorded)
+        everything = page.get_by_role("button", name="Show all of it again")
+        expect(page.locator(".pane canvas.plot")).to_have_count(2)
+        row(page, key()).locator(".twist").click()
+        row(page, f"{key()}.y").drag_to(page.locator(".pane canvas.plot").first)
+        first = page.locator(".pane").first.locator(".legend button[aria-pressed]")
+        expect(first).to_have_text([re.compile(rf"^{key()}\.{name} ") for name in "xy"])
+        box = page.locator(".pane canvas.plot").first.bounding_box()
+        page.mouse.move(box["x"] + box["width"] - 20, box["y"] + 50)
+        with page.expect_request(lambda request: "/api/series" in request.url and "start=" in request.url):
+            page.keyboard.down("Control")
+            page.mouse.wheel(0, -200)
+            page.keyboard.up("Control")
+        expect(everything).to_have_count(2)
+        page.context.close()
 
 
 @pytest.mark.long

@@ -1,7 +1,7 @@
 // Arrays: as an image, as lines, as a table, as a histogram; a part of them where there are more than two axes.
 import { Course } from "./course.js";
 import { Overlay, overlayField } from "./overlay.js";
-import { Histogram, Plot } from "./plot.js";
+import { Plot } from "./plot.js";
 import { el, getJson, getPicture, numberEl, setNumbers, setText, swap, toast } from "./util.js";
 
 const TITLES = { image: "Image", line: "Lines", table: "Table", histogram: "Histogram" };
@@ -226,13 +226,14 @@ export class ArrayView {
     setText(this.more, `${data.more} more columns are not drawn.`);
   }
 
-  histogramStage() { this.plot = new Histogram(this.stage, { label: "Histogram" }); }
+  histogramStage() { this.plot = new Plot(this.stage, { label: "Histogram", bars: true }); }
 
   async histogramShow(values, signal) {
     const data = await getJson("histogram", values, signal);
     if (this.view !== "histogram") return;
     this.tell(data);
-    this.plot.set({ ...data, names: [], times: [], lines: [] });
+    const { low, high, counts } = data, each = (high - low) / Math.max(counts.length, 1);
+    this.plot.set({ names: [""], times: counts.map((_, index) => low + index * each), lines: [counts], start: low, end: high });
   }
 
   tableStage() {

@@ -16,20 +16,18 @@ export class Gestures {
     canvas.addEventListener("pointerdown", (event) => this.onDown(event));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => this.onUp(event, name === "pointerup"));
     canvas.style.cursor = options.onPick ? "crosshair" : "";
-    if (options.fixed) return;
     canvas.addEventListener("wheel", (event) => this.onWheel(event), { passive: false });
     canvas.addEventListener("dblclick", () => { clearTimeout(this.picking); this.reset(); });
     canvas.addEventListener("keydown", (event) => this.onKey(event));
     canvas.setAttribute("aria-keyshortcuts", "+ - < > 0");
     const button = (text, title, act) => el("button", { type: "button", title, "aria-label": title, onclick: act }, text);
     this.all = button("All", `Show all of it again (double click on the plot; keys: ${KEYS})`, () => this.reset());
-    this.log = button("log", "Logarithmic axis", () => plot.setLog(!plot.log));
+    this.log = button("log", "Logarithmic axis", () => { plot.log = !plot.log; options.onLog?.(plot.log); plot.draw(); });
     plot.tools.append(this.all, button("−", "Zoom out (wheel, or two fingers)", () => this.scale(STEP)),
       button("+", "Zoom in (wheel, two fingers, or drag over a part; drag with Shift moves)", () => this.scale(1 / STEP)), this.log);
   }
 
   show() {
-    if (!this.all) return;
     this.all.hidden = !(this.plot.axis ? this.plot.axis.window : this.plot.window);
     this.log.setAttribute("aria-pressed", String(this.plot.log));
   }
@@ -69,7 +67,6 @@ export class Gestures {
     const { plot, drag } = this;
     if (!drag || !this.pointers.has(event.pointerId)) return plot.point(plot.xAt(event.clientX));
     this.pointers.set(event.pointerId, event.clientX);
-    if (plot.options.fixed) return undefined;
     const [x0, x1] = drag.window, perPixel = (x1 - x0) / drag.width, now = [...this.pointers.values()];
     if (now.length === 2 && drag.fingers.length === 2) {
       drag.moved = true;
@@ -95,7 +92,7 @@ export class Gestures {
     if (!ended || !drag) return plot.paint();
     if (!drag.moved && event.button === 0) {
       clearTimeout(this.picking);
-      this.picking = setTimeout(() => plot.options.onPick?.(drag.at), this.all?.hidden === false ? DOUBLE : 0);
+      this.picking = setTimeout(() => plot.options.onPick?.(drag.at), this.all.hidden === false ? DOUBLE : 0);
       return plot.paint();
     }
     if (selection) plot.zoom(Math.min(...selection), Math.max(...selection));

@@ -15,7 +15,6 @@ export class Overlay {
     Object.assign(this, { image, app, address });
     this.canvas = el("canvas", { class: "overlay", "aria-hidden": "true" });
     this.wrong = el("p", { class: "wrong", role: "alert", hidden: true });
-    image.after(this.canvas);
     new ResizeObserver(() => this.draw()).observe(image);
   }
 
@@ -32,7 +31,8 @@ export class Overlay {
   draw() {
     const { canvas, image } = this, wide = image.clientWidth, tall = image.clientHeight, ratio = window.devicePixelRatio || 1;
     if (!this.said || !wide) return;
-    canvas.hidden = !this.said.shapes.length;
+    if (!this.said.shapes.length) return canvas.remove();
+    if (!canvas.isConnected) image.after(canvas);
     Object.assign(canvas.style, { left: `${image.offsetLeft}px`, top: `${image.offsetTop}px`, width: `${wide}px`, height: `${tall}px` });
     [canvas.width, canvas.height] = [wide * ratio, tall * ratio];
     const context = canvas.getContext("2d"), style = getComputedStyle(canvas), [columns, rows] = this.size, fit = Math.min(wide / columns, tall / rows);

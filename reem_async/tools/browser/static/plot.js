@@ -1,4 +1,4 @@
-// Lines and bars on a canvas: axes, gaps, a cursor with the values under it, and a mark for the instant shown.
+// Lines and filled steps on a canvas: axes, gaps, a cursor with the values under it, and a mark for the instant shown.
 import { Gestures } from "./gestures.js";
 import { clockText, el, numberText, setText } from "./util.js";
 
@@ -11,12 +11,9 @@ const SILENCE = 0.5; // s of no update that are marked, beside a loss
 const MINUTES = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 21600, 86400];
 
 function ticks(low, high, most, clock = false) {
-  const span = Math.min(high - low || 1, Number.MAX_VALUE);
-  const raw = span / Math.max(most, 1);
-  const power = 10 ** Math.floor(Math.log10(raw));
+  const span = Math.min(high - low || 1, Number.MAX_VALUE), raw = span / Math.max(most, 1), power = 10 ** Math.floor(Math.log10(raw));
   const steps = clock && raw > 1 ? MINUTES : [1, 2, 5, 10].map((each) => each * power);
-  const step = steps.find((each) => each >= raw) ?? span;
-  const found = [];
+  const step = steps.find((each) => each >= raw) ?? span, found = [];
   for (let at = Math.ceil(low / step) * step; at <= high + step * 1e-9 && found.length < 30; at += step) found.push(at);
   return { step, found };
 }
@@ -46,6 +43,16 @@ function line(context, colour, thick, ...ends) {
   context.stroke();
 }
 
+// Do something that draws in these spans of the x axis only.
+function within(context, spans, height, act) {
+  const room = new Path2D();
+  for (const [from, to] of spans) room.rect(from, 0, to - from, height);
+  context.save();
+  context.clip(room);
+  act();
+  context.restore();
+}
+
 // Spans without the holes in them.
 function without(spans, holes) {
   for (const [from, to] of holes) {
@@ -66,7 +73,7 @@ function indexAt(times, at) {
 
 export class Plot {
   // options: axis, the TimeAxis of all plots over time; onPick, called with the x that was clicked; small, it is in a
-  // pane; log, the axis is logarithmic at first; onLog, called when that changes; onRemove, called with a key to take out.
+  // pane; bars, each value holds until the next x, filled; log, the axis is logarithmic at first; onLog, called when that changes; onRemove, called with a key to take out.
   constructor(parent, options = {}) {
     this.options = options;
     this.axis = options.axis ?? null;
@@ -102,8 +109,8 @@ export class Plot {
   }
 
   get hover() { return this.axis ? this.axis.hover : this.pointed; }
-
   get times() { return Boolean(this.axis); }
+  get steps() { return this.times || Boolean(this.options.bars); }
 
   xAt(clientX) {
     const box = this.canvas.getBoundingClientRect();
@@ -133,12 +140,6 @@ export class Plot {
     return this.draw();
   }
 
-  setLog(log) {
-    this.log = log;
-    this.options.onLog?.(log);
-    this.draw();
-  }
-
   range() {
     const [first, last] = this.full();
     [this.x0, this.x1] = (this.axis ? this.axis.shown : this.window) ?? [this.data?.start ?? first, this.data?.end ?? last];
@@ -151,18 +152,18 @@ export class Plot {
       for (let index = Math.max(indexAt(times, this.x0), 0); index <= to; index += 1) {
         const value = values[index];
         if (value === null) continue;
-        if (this.log && value <= 0) { this.below += 1; continue; }
-        if (value < low) low = value;
-        if (value > high) high = value;
+        if (this.log && value <= 0) this.below += 1;
+        else [low, high] = [Math.min(low, value), Math.max(high, value)];
       }
     }
     if (low > high) [low, high] = this.log ? [1, 10] : [0, 1];
+    if (this.options.bars && !this.log) low = 0;
     [this.low, this.high] = [low, high];
     if (this.log) [low, high] = [Math.log10(low), Math.log10(high)];
     const size = Math.max(Math.abs(low), Math.abs(high));
     // Floats have 15 to 16 digits: labels of parts of less than that would be the same, and so would the lines be.
     const pad = high === low ? (this.log ? 0.3 : size * 0.05 || 1) : Math.max((high / 2 - low / 2) * 0.12, size * LEAST_SPAN);
-    this.y0 = Math.max(low - pad, -Number.MAX_VALUE);
+    this.y0 = this.options.bars && !this.log ? 0 : Math.max(low - pad, -Number.MAX_VALUE);
     this.y1 = Math.min(high + pad, Number.MAX_VALUE);
   }
 
@@ -178,8 +179,7 @@ export class Plot {
     this.style = getComputedStyle(canvas);
     this.range();
     this.axes(context, box.width, box.height);
-    if (this.data?.counts) this.bars(context, box.width, box.height);
-    else this.drawCurves(context, box.width, box.height);
+    within(context, [[this.left - 1, box.width - RIGHT + 1]], box.height - BOTTOM + 1, () => this.drawCurves(context, box.width, box.height));
     this.explain();
     this.gestures.show();
     this.paint();
@@ -201,7 +201,7 @@ export class Plot {
       context.globalAlpha = 1;
     }
     for (const [at, colour, thick] of [[this.cursor, "--mark", 2], [this.hover, "--faint", 1]]) {
-      if (at === null || at < this.x0 || at > this.x1 || this.data?.counts) continue;
+      if (at === null || at < this.x0 || at > this.x1) continue;
       line(context, this.colour(colour), thick, [x(at), TOP], [x(at), height - BOTTOM]);
       if (at === this.hover) this.label(context, x(at), this.where(at));
     }
@@ -240,7 +240,7 @@ export class Plot {
     const offset = this.times ? Math.floor(this.x0 / 3600) * 3600 : 0;
     const columns = ticks(this.x0 - offset, this.x1 - offset, (width - this.left - RIGHT) / 90, this.times);
     for (const at of columns.found) {
-      const digits = Math.min(Math.max(-Math.floor(Math.log10(columns.step) + 1e-9), 0), 3);
+      const digits = Math.min(Math.max(-Math.floor(Math.log10(columns.step) + 1e-9), 0), 4);
       const text = this.times ? clockText(at + offset + 1e-6, digits) : tickText(at, columns.step);
       const where = Math.min(Math.max(x(at + offset), this.left + 14), width - RIGHT - 28);
       context.fillText(text, where, height - BOTTOM + 7);
@@ -250,48 +250,40 @@ export class Plot {
   drawCurves(context, width, height) {
     const { x, y } = this.place(width, height), area = [this.left, width - RIGHT];
     const spans = (list) => (list ?? []).map(([from, to]) => [x(from), x(to)]).filter(([from, to]) => to > area[0] && from < area[1]);
-    const room = new Path2D();
-    room.rect(this.left - 1, 0, width - RIGHT - this.left + 2, height - BOTTOM + 1);
-    context.save();
-    context.clip(room);
     this.curves.forEach(({ values, times, name, set }, index) => {
       if (this.hidden.has(name)) return;
       const holes = spans(set.losses).filter(([from, to]) => to - from >= 1), quiet = without(spans(set.quiet), holes);
-      const path = new Path2D(), last = indexAt(times, this.x1) + (this.times ? 0 : 1);
+      const path = new Path2D(), last = indexAt(times, this.x1) + (this.steps ? 0 : 1);
       let before = null;
       for (let at = Math.max(indexAt(times, this.x0), 0); at <= last && at < times.length; at += 1) {
         const value = values[at];
         if (value === null || (this.log && value <= 0)) {
-          if (before !== null && this.times) path.lineTo(x(times[at]), before);
+          if (before !== null && this.steps) path.lineTo(x(times[at]), before);
           before = null;
           continue;
         }
-        const across = x(this.times ? Math.max(times[at], this.x0) : times[at]), up = y(value);
+        const across = x(this.steps ? Math.max(times[at], this.x0) : times[at]), up = y(value);
         if (before === null) path.moveTo(across, up);
-        else if (this.times) path.lineTo(across, before);
+        else if (this.steps) path.lineTo(across, before);
         path.lineTo(across, up);
         before = up;
       }
-      if (before !== null && this.times) path.lineTo(x(Math.min(this.x1, set.end ?? this.x1)), before); // it still is what it was
+      const end = x(Math.min(this.x1, set.end ?? this.x1));
+      if (before !== null && this.steps) path.lineTo(end, before); // it still is what it was
       const colour = this.colour(`--curve-${index % 8}`);
       Object.assign(context, { strokeStyle: colour, fillStyle: colour, lineWidth: 1.6, lineJoin: "round" });
-      this.stroke(context, path, without([[0, width]], [...holes, ...quiet]), []);
-      this.stroke(context, path, quiet, [2, 4]);
+      if (this.options.bars && before !== null) {
+        const below = new Path2D(path);
+        for (const edge of [end, x(Math.max(times[0], this.x0))]) below.lineTo(edge, height - BOTTOM);
+        context.globalAlpha = 0.4;
+        context.fill(below);
+        context.globalAlpha = 1;
+      }
+      within(context, without([[0, width]], [...holes, ...quiet]), height, () => context.stroke(path));
+      within(context, quiet, height, () => { context.setLineDash([2, 4]); context.stroke(path); });
       if (times.length === 1 && before !== null) context.fillRect(x(times[0]) - 2, before - 2, 5, 5);
     });
     for (const { losses } of this.sets) this.drawLosses(context, spans(losses), height);
-    context.restore();
-  }
-
-  stroke(context, path, spans, dash) {
-    if (!spans.length) return;
-    const shown = new Path2D();
-    for (const [from, to] of spans) shown.rect(from, 0, to - from, this.height);
-    context.save();
-    context.clip(shown);
-    context.setLineDash(dash);
-    context.stroke(path);
-    context.restore();
   }
 
   // Where updates were lost: a tinted span, and a triangle at its end, which is seen however short it is.
@@ -313,28 +305,13 @@ export class Plot {
     this.note.hidden = !this.note.textContent;
   }
 
-  bars(context, width, height) {
-    const { x, y } = this.place(width, height), { counts } = this.data;
-    const each = (this.x1 - this.x0) / counts.length;
-    context.fillStyle = this.colour("--curve-0");
-    counts.forEach((count, index) => {
-      const left = x(this.x0 + index * each), right = x(this.x0 + (index + 1) * each);
-      context.fillRect(left, y(count), Math.max(right - left - (right - left > 4 ? 1 : 0), 0.5), y(0) - y(count));
-    });
-  }
-
   readout() {
     const at = this.hover ?? this.cursor, { curves } = this;
-    if (this.data?.counts) {
-      const { counts } = this.data, each = (this.x1 - this.x0) / Math.max(counts.length, 1);
-      const index = at === null ? -1 : Math.min(Math.floor((at - this.x0) / each), counts.length - 1);
-      const from = this.x0 + index * each;
-      return this.legend.replaceChildren(index < 0 ? "" : `${numberText(from)} … ${numberText(from + each)}: ${counts[index]}`);
-    }
     if (!curves.length || (at === null && curves.length === 1)) return this.legend.replaceChildren();
     this.entries(curves.map(({ name }) => name).join("|"));
-    curves.forEach(({ values, times, name }, number) => {
-      const { text, element } = this.named[number], value = values[at === null ? times.length - 1 : indexAt(times, at)] ?? null;
+    curves.forEach(({ values, times, name, set }, number) => {
+      const lost = at !== null && (set.losses ?? []).some(([from, to]) => at > from && at < to); // what it was is not known
+      const { text, element } = this.named[number], value = lost ? null : values[at === null ? times.length - 1 : indexAt(times, at)] ?? null;
       setText(text, `${name}${name && " "}${numberText(value)}`);
       element.title = `${value ?? ""}${curves.length > 1 ? "\nA click hides or shows this line" : ""}`.trim();
       if (curves.length > 1) element.setAttribute("aria-pressed", String(!this.hidden.has(name)));
@@ -344,10 +321,10 @@ export class Plot {
 
   // The place of the cursor, and what a mark there means.
   where(at) {
-    if (!this.times) return `${this.data?.times[indexAt(this.data.times, at)] ?? ""}`;
-    const close = (CLOSE / Math.max(this.width - this.left, 1)) * (this.x1 - this.x0);
-    const hit = (name, more) => this.sets.flatMap((set) => set[name] ?? []).find(([from, to]) => at >= from - more && at <= to + more);
-    const loss = hit("losses", close);
+    const from = this.data?.times[indexAt(this.data.times, at)], to = this.data?.times[indexAt(this.data.times, at) + 1] ?? this.data?.end;
+    if (!this.times) return from === undefined ? "" : this.options.bars ? `${numberText(from)} … ${numberText(to)}` : `at ${numberText(from)}`;
+    const hit = (name, more) => this.sets.flatMap((set) => set[name] ?? []).find(([start, end]) => at >= start - more && at <= end + more);
+    const loss = hit("losses", (CLOSE / Math.max(this.width - this.left, 1)) * (this.x1 - this.x0));
     const said = loss ? `${loss[2] ?? ""} ${loss[2] === 1 ? "update" : "updates"} lost` : hit("quiet", 0) ? "no update came" : "";
     return [clockText(at), said.trim()].filter(Boolean).join(" ");
   }
@@ -360,29 +337,12 @@ export class Plot {
       if (this.curves.length === 1) return { text, element: text };
       const swatch = el("i");
       swatch.style.background = `var(--curve-${number % 8})`;
-      const element = el("button", { type: "button", onclick: () => this.toggle(name) }, swatch, text);
+      const element = el("button", { type: "button", onclick: () => { if (!this.hidden.delete(name)) this.hidden.add(name); this.draw(); } }, swatch, text);
       const last = set.key && set !== this.data && this.curves[number + 1]?.set !== set;
       const remove = last ? el("button", { type: "button", class: "remove", title: `Take ${set.key} out of this plot`, "aria-label": `Take ${set.key} out of this plot`, onclick: () => this.options.onRemove?.(set.key) }, "×") : null;
       return { text, element, remove };
     });
     this.named.key = key;
     this.legend.replaceChildren(...this.named.map(({ element, remove }) => (remove ? el("span", { class: "entry" }, element, remove) : element)));
-  }
-
-  toggle(name) {
-    if (!this.hidden.delete(name)) this.hidden.add(name);
-    this.draw();
-  }
-}
-
-export class Histogram extends Plot {
-  constructor(parent, options = {}) { super(parent, { ...options, fixed: true }); }
-
-  range() {
-    const { low, high, counts } = this.data ?? {};
-    [this.x0, this.x1] = [low ?? 0, high ?? 1];
-    if (this.x1 <= this.x0) [this.x0, this.x1] = [this.x0 - 0.5, this.x0 + 0.5];
-    [this.y0, this.y1] = [0, Math.max(...(counts?.length ? counts : [1])) * 1.06];
-    [this.low, this.high] = [this.x0, this.x1];
   }
 }
