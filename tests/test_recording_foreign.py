@@ -24,6 +24,7 @@ from reem_async import KeyValueStore, PublishSpace
 from reem_async.errors import BadData, BadType, BadValue
 from reem_async.recording import DamagedRecording, Recorder, Replayer, open_log
 from reem_async.ships import Jpeg
+from reem_async.tools.browser.logsource import LogSource
 from reem_async.tools.recording.cdr import compiled
 
 BEGIN = 1_700_000_000_000_000_123
@@ -455,3 +456,38 @@ def test_times_of_centuries_ahead(tmp_path):
         assert log["x"].history(clock="publisher")[0].tolist() == [(2**64 - 1) / 1e9, 5e-9]
         assert [update.value for update in log.updates()] == [1, 1]
         assert log.tree_at(log.end) == {"x": 1}
+
+
+async def test_on_the_page(ros, tmp_path):
+    """Several files, and a topic that is left out."""
+    path = tmp_path / "more.mcap"
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/old", "ros1", 0), BEGIN, b"", BEGIN)
+        writer.add_message(writer.register_channel("/a.b", "json", 0), BEGIN, b'{"n": 7}', BEGIN)
+        writer.finish()
+    source = LogSource([ros, path])
+    try:
+        await source.start()
+        await source.opened()
+        status = source.status()
+        assert (source.title, status.note) == ("ros.mcap and 1 more", "1 topic is left out, see reem log info")
+        page = await source.children((), 0, 100, None)
+        assert [node.path[0] for node in page.nodes] == [
+            "a.b",
+            "arm/state",
+            "eye/bgr",
+            "eye/jpeg",
+            "eye/mono",
+            "eye/odd",
+        ]
+        (node,) = await source.nodes([("eye/bgr", "data")], None)
+        assert node.text == "uint8[20,24,3]"
+        assert (await source.value(("eye/bgr", "data"), None)).value.shape == (20, 24, 3)
+        assert type((await source.value(("eye/jpeg", "data"), None)).value) is Jpeg
+        series = await source.series(("arm/state", "force"), status.start, status.end)
+        assert [len(line) for line in series.lines] == [10, 10, 10]
+        assert repr(str(ros)) in source.snippets(("arm/state",), None)["recording"]
+    finally:
+        await source.close()

@@ -134,7 +134,8 @@ class LogSource(Source):
         if self.log.damaged:
             notes.append(f"{self.log.damaged} damaged records are skipped")
         if self.log.undecoded:
-            notes.append(f"{len(self.log.undecoded)} topics are left out, see reem log info")
+            count = len(self.log.undecoded)
+            notes.append(f"{count} topic{' is' if count == 1 else 's are'} left out, see reem log info")
         start, end = (instant and instant + _ROUNDING for instant in (self.log.start, self.log.end))
         return Status(start, end, "", "; ".join(notes), part)
 

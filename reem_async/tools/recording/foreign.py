@@ -85,6 +85,9 @@ class Foreign:
         value = get(self._message(it.where), it.path[1:])
         if value is MISSING:
             raise DamagedRecording(f"{it.shown}: the message of {it.at} ns is damaged")
+        if isinstance(value, np.ndarray) and not value.flags.c_contiguous:
+            value = np.ascontiguousarray(value)
+            value.flags.writeable = False
         return value
 
     def _decoded(self, ref: Ref) -> Any:
@@ -258,7 +261,9 @@ def _raw(message: Mapping[str, Any], data: bytes | memoryview) -> np.ndarray[Any
     shape = (height, width, channels) if channels > 1 else (height, width)
     rows = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(height, step)[:, :row])
     picture: np.ndarray[Any, Any] = rows.view(dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
-    if encoding in ("bgr8", "bgra8"):
-        picture = picture[:, :, [2, 1, 0, 3][:channels]]
+    if encoding == "bgr8":
+        picture = picture[:, :, ::-1]  # a view: most pictures are decoded for what is beside them, and not looked at
+    elif encoding == "bgra8":
+        picture = picture[:, :, [2, 1, 0, 3]]
     picture.flags.writeable = False
     return picture
