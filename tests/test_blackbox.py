@@ -46,6 +46,7 @@ async def test_what_is_saved_equals_a_recording_made_beside_it(key, akvs, apspac
         assert not (tmp_path / "crash.mcap").exists()
         assert await saving == tmp_path / "crash.mcap"
         assert 0 < box.status.messages < 150
+        assert box.status.rate > 0
         await apspace[arm]["n"].write(99)  # not in it
     with open_log(tmp_path / "crash.mcap") as saved, open_log(tmp_path / "beside.mcap") as whole:
         assert 0.5 < saved.duration < 3

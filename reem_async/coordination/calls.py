@@ -166,8 +166,11 @@ async def opened(session: Session, content: Content | None, prefix: str, where: 
             ship = ships.labelled(label, where)
             if not content.is_stored and ship.blob is None:
                 raise BadData(f"{where}: the ship {label!r} of this interface reads in another way than the sender's")
-            value = ship.ship.interpret_read([piece if ship.blob is not None else with_bytes(piece)])
-            values[label, tail] = await value if inspect.isawaitable(value) else value
+            try:
+                value = ship.ship.interpret_read([piece if ship.blob is not None else with_bytes(piece)])
+                values[label, tail] = await value if inspect.isawaitable(value) else value
+            except BadData as error:  # such as of a damaged picture
+                raise BadData(f"{where}: {error}") from error
         return assembled(bytes(pieces[0]), values, _DEEPEST)
     except BadData:
         raise

@@ -46,7 +46,7 @@ class BlackBox:
         self.stored: set[str] = set()
         self.saves: list[WriterThread] = []  # files in the making, which get what follows
         self.bytes = 0  # of memory, of all operations
-        self._seconds = seconds
+        self.seconds = seconds
         self._memory = memory
         self._kept: collections.deque[tuple[Operation, int]] = collections.deque()
         self._states: dict[str, Any] = {}  # what each key held before the first operation
@@ -93,7 +93,7 @@ class BlackBox:
         operation, size = _packed(operation, size)
         self._kept.append((operation, size))
         self.bytes += size
-        while self._kept[0][0].stamp[0] < at - self._seconds * 1e9:
+        while self._kept[0][0].stamp[0] < at - self.seconds * 1e9:
             self._fold()
         if at > self._weighed + _WEIGHED:
             self._weigh(at)

@@ -395,9 +395,11 @@ class Recorder:
         """How the recording is getting on. Any thread may ask."""
         counts, now = self.writer_thread.counts, self._ended or time.monotonic()
         seconds = max(now - self._begun, 0.0) if self._begun else 0.0
+        messages = counts.messages if self._box is None else self._box.messages
+        span = seconds if self._box is None else min(seconds, self._box.seconds)
         return RecorderStatus(
             seconds,
-            counts.messages if self._box is None else self._box.messages,
+            messages,
             counts.bytes if self._box is None else self._box.bytes,
             0 if isinstance(self.writer_thread, BlackBox) else self.writer_thread.file_bytes,
             counts.dropped,
@@ -406,7 +408,7 @@ class Recorder:
             counts.lost,
             self._sampler.late,
             self._sampler.failed,
-            counts.messages / seconds if seconds else 0.0,
+            messages / span if span else 0.0,
             counts.clock_steps,
         )
 
