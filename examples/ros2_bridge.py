@@ -367,12 +367,13 @@ class Bridge:
             place = place[name]
         return place
 
-    def report(self, entry: Entry, text: str) -> None:
+    def report(self, entry: Entry | None, text: str) -> None:
         """Log each problem of an entry once, with its line in the file."""
-        seen = self._reported.setdefault(entry.where, set())
+        where = "" if entry is None else f"{entry.where}: "
+        seen = self._reported.setdefault(where, set())
         if text not in seen and len(seen) < MOST_REPORTED:
             seen.add(text)
-            logger.warning("%s: %s", entry.where, text)
+            logger.warning("%s%s", where, text)
 
     def make_parents(self) -> None:
         for entry in (*self._topics, *(each.entry for each in self._parameters)):
@@ -382,7 +383,7 @@ class Bridge:
 
     def _failed(self, error: Exception) -> None:
         self._lacking = True  # a server that was restarted without its data has none
-        logger.warning("an update of ROS was not stored: %s", error)
+        self.report(None, f"a message was not stored: {error}")
 
     def run(self, target: Callable[..., None], *args: Any) -> None:
         """Run a function for as long as the bridge; its failure ends the bridge, so that it can be started again."""

@@ -271,9 +271,15 @@ def test_topics_go_both_ways(running, graph, caplog, server_url, bridge):
         eventually(lambda: publisher.publish(joints) or "joints" in kvs.get("arm", {}))
         assert kvs["arm"]["joints"]["position"].read().tolist() == [1.0, 2.0]
         del kvs["arm"]
+    kvs["arm"] = "no dict"  # each problem is reported once
+    for _ in range(20):
+        publisher.publish(joints)
+    eventually(lambda: "has no element 'joints'" in caplog.text)
+    assert kvs["arm"].read() == "no dict"
     image = bridge.from_dict(rosstub.MESSAGES["sensor_msgs/Image"], np.full((480, 640, 3), 7, np.uint8), "")
     node.create_publisher(type(image), "/camera", None).publish(image)
     eventually(lambda: "camera" in kvs)
+    assert caplog.text.count("has no element 'joints'") == 1
     assert kvs["camera"]["data"].read().shape == (480, 640, 3)
     # To ROS: what was stored before goes to late subscribers of a latched topic; wrong values are reported.
     eventually(lambda: [each.data for each in graph.published.get("/state", ())] == ["ready"])
