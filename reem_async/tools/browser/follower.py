@@ -29,6 +29,7 @@ from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event, Monitor
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer, find_regularly, present_keys
 from ...store.document import opened
+from ..recording.times import PATIENCE, Arrivals
 from .history import LARGEST_TEXT, History
 from .source import Loss
 from .timeline import PENDING
@@ -278,7 +279,8 @@ class Follower:
         # Bytes of long documents that may be kept
         self.texts = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
         self.arrays = Allowance(BACKGROUND_RATE * UNSEEN, history.budget / 2)  # bytes of arrays that may be read
-        self.monitor = Monitor(interface, policy=Last(_WAITING), raw=True)
+        self.monitor = Monitor(interface, policy=Last(_WAITING), raw=True, patience=PATIENCE)
+        self._arrivals = Arrivals(PATIENCE)
         self.monitor.invalidated = lambda name: self.key(name).doubt()
         self.monitor.broken, self.monitor.changed = self._broken, self._changed
         self.monitor.resynchronised = self._read_again
@@ -354,7 +356,9 @@ class Follower:
             self.names.add(name)
             if not self.history.knows(name) and name not in self.unread:
                 self.history.begin(name, None)
-        when = self.history.clock.of(event.received)
+        # Not before what was read meanwhile, which the updates that waited here come after.
+        arrived = self._arrivals.of(event.publisher, event.time, event.received)
+        when = max(self.history.clock.of(arrived), self.history.newest)
         if event.gap:
             since = self.history.last([(name,)], when).get((name,), when)
             self.history.losses.add(name, Loss(since, when, event.missed or None))

@@ -216,6 +216,11 @@ class History:
     def bytes(self) -> int:
         return self._bytes + self.frames.bytes
 
+    @property
+    def newest(self) -> float:
+        """When the last change was noted; 0 if there is none."""
+        return self._all[-1].time if self._all else 0.0
+
     # --- what happened
 
     def add(self, path: Path, value: Any, size: int, when: float, *, answer: bool = False) -> None:
