@@ -83,7 +83,11 @@ def plain_url():
 @pytest.fixture
 def url(request, pair):
     """A server of the kind; with REEM_TEST_SERVER=plain the shared one is plain too."""
-    return request.getfixturevalue("server_url" if pair[1] == "json" else "plain_url")
+    if pair[1] == "plain":
+        return request.getfixturevalue("plain_url")
+    if (address := request.getfixturevalue("server_url")).startswith("redis+cluster:"):
+        pytest.skip("the clients are for one server")
+    return address
 
 
 def run(client, *words):
@@ -352,15 +356,15 @@ def test_bytes_that_are_no_value_are_an_error_and_no_crash(client, plain_url, ke
 
 
 @contextlib.contextmanager
-def server_that_says(reply):
-    """A server that greets, answers one command, sends some bytes, and ends; its address."""
+def server_that_says(reply, greeting=HELLO + b"+none\r\n"):
+    """A server that sends what answers two commands, then some bytes, and ends; its address."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve():
             with contextlib.suppress(OSError):
                 connection, _ = listener.accept()
                 with connection:
-                    connection.sendall(HELLO + b"+none\r\n" + reply)
+                    connection.sendall(greeting + reply)
                     connection.shutdown(socket.SHUT_WR)
                     while connection.recv(65536):
                         pass
@@ -405,6 +409,20 @@ def test_truncated_and_hostile_replies_are_an_error_and_no_crash(client):
             with server_that_says(reply) as address:
                 done = run(client, address, words, "foo", *(["n=1"] if words == "publish" else []))
                 assert ends_with_an_error(done) if words == "watch" else refuses(done), (reply, words, done)
+
+
+@IN_C
+def test_a_client_refuses_servers_that_it_is_not_for(client):
+    """A cluster has other channels; a user without rights is no sign of a plain server, whose documents are text."""
+    for greeting, said in (
+        (b"%1\r\n+mode\r\n+cluster\r\n+none\r\n", "not a single server"),
+        (HELLO + b"-NOPERM this user may not run JSON.TYPE\r\n", "NOPERM"),
+    ):
+        with server_that_says(b"+OK\r\n+none\r\n_\r\n*0\r\n" + b"+OK\r\n" * 9, greeting) as address:
+            assert said in refused(client, address, "publish", "foo", "n=1")
+    error = refused(client, "redis://:secret@127.0.0.1:1/3", "get", "foo")  # another database, which it does not select
+    assert "[:port]" in error or "database 0" in error
+    assert "secret" not in error
 
 
 LINES = [

@@ -204,7 +204,9 @@ static void open_connection(const char *url) {
     const char *rest = strncmp(url, "redis://", 8) ? "" : url + 8, *at = strrchr(rest, '@');
     if (at != NULL && sscanf(rest, ":%255[^@]", password) != 1) sscanf(rest, "%255[^:@]:%255[^@]", user, password);
     sscanf(at ? at + 1 : rest, "%255[^:/]", host);
-    sscanf((at ? at + 1 : rest) + strlen(host), ":%7[0-9]", port);
+    const char *behind_port = (at ? at + 1 : rest) + strlen(host);
+    if (sscanf(behind_port, ":%7[0-9]", port) == 1) behind_port += 1 + strlen(port);
+    if (*behind_port && strcmp(behind_port, "/") && strcmp(behind_port, "/0")) host[0] = 0;
     struct addrinfo hints = {.ai_socktype = SOCK_STREAM}, *found;
     if (!host[0]) fail("the URL is not like redis://[user:password@]host[:port]");
     if (getaddrinfo(host, port, &hints, &found) != 0) fail("there is no host %s", host);
@@ -215,10 +217,15 @@ static void open_connection(const char *url) {
         connection = -1;
     }
     if (connection < 0) fail("no server answers at %s:%s: %s", host, port, strerror(errno));
-    if (password[0]) SEND(T("HELLO"), T("3"), T("AUTH"), T("%s", user), T("%s", password));
-    else SEND(T("HELLO"), T("3"));
+    Reply hello = password[0] ? SEND(T("HELLO"), T("3"), T("AUTH"), T("%s", user), T("%s", password)) : SEND(T("HELLO"), T("3"));
+    for (long long item = 1; item < hello.number; item++) {
+        int is_mode = is(hello.items[item - 1].text, "mode") && !is(hello.items[item].text, "standalone");
+        if (is_mode) fail("this is not a single server, but: %s", hello.items[item].text.data);
+    }
     Text words[] = {T("JSON.TYPE"), T("_")};
-    has_json = sent(words, 2, 1).kind != '-'; // a server without the JSON module holds documents as text
+    Reply kind = sent(words, 2, 1); // a server without the JSON module holds documents as text
+    has_json = kind.kind != '-';
+    if (!has_json && strncmp(kind.text.data, "ERR unknown command", 19)) fail("the server refused JSON.TYPE: %s", kind.text.data);
 }
 
 // Documents: the text of JSON is never turned into a tree. A value is the part of the text that holds it.
@@ -523,7 +530,7 @@ static void publish(const Place *place, char **words, int count) {
         SEND(T("WATCH"), key, ships, lease);
         Text kind = SEND(T("TYPE"), key).text;
         int is_text = !has_json && is(kind, "string") && is(SEND(T("GETRANGE"), key, T("0"), T("0")).text, " ");
-        if (!is(kind, "none") && !is(kind, "ReJSON-RL") && !is_text) fail("%s is a key of another program", key.data);
+        if (!is(kind, "none") && !(has_json && is(kind, "ReJSON-RL")) && !is_text) fail("%s is a key of another program", key.data);
         if (SEND(T("GET"), lease).kind != '_') fail("%s is owned by another program", key.data);
         Reply old = list(SEND(T("SMEMBERS"), ships));
         SEND(T("MULTI"));

@@ -26,15 +26,17 @@ class Connection {
 
   static async open(text) {
     const url = new URL(text), it = new Connection(), password = decodeURIComponent(url.password);
-    check(url.protocol === "redis:", "the URL is not like redis://[user:password@]host[:port]");
+    check(url.protocol === "redis:" && ["", "/", "/0"].includes(url.pathname), "the URL is not like redis://[user:password@]host[:port]");
     const end = (why) => { it.#ended ??= why; it.#wake(); };
     it.socket = net.connect(Number(url.port || 6379), url.hostname);
     it.socket.on("data", (piece) => { it.#size += it.#pieces.push(piece) && piece.length; it.#wake(); });
     it.socket.on("error", (error) => end(error.message)).on("close", () => end("the server closed the connection"));
-    await it.send("HELLO", "3", ...(password ? ["AUTH", url.username || "default", password] : []));
+    const hello = await it.send("HELLO", "3", ...(password ? ["AUTH", url.username || "default", password] : []));
+    const words = hello.map(String), mode = words.includes("mode") ? words[words.indexOf("mode") + 1] : "standalone";
+    check(mode === "standalone", `this is not a single server, but: ${mode}`);
     // A server without the JSON module holds documents as text
     it.hasJson = await it.send("JSON.TYPE", "_").then(() => true, (error) => {
-      if (!(error instanceof Failure)) throw error;
+      if (!error.message.includes("ERR unknown command")) throw error;
       return false;
     });
     return it;
@@ -263,7 +265,7 @@ async function publish(server, place, words) {
     await server.send("WATCH", key, `${tag}:ships`, `${tag}:lease`);
     const kind = await server.send("TYPE", key);
     const isText = !server.hasJson && kind === "string" && String(await server.send("GETRANGE", key, 0, 0)) === " ";
-    check(["none", "ReJSON-RL"].includes(kind) || isText, `${key} is a key of another program`);
+    check(kind === "none" || (server.hasJson && kind === "ReJSON-RL") || isText, `${key} is a key of another program`);
     check((await server.send("GET", `${tag}:lease`)) === null, `${key} is owned by another program`);
     const old = (await server.send("SMEMBERS", `${tag}:ships`)).map((it) => tag + it);
     await server.send("MULTI");
@@ -311,6 +313,7 @@ async function watch(server, place, most) {
   // Return how many updates of a publisher are missing before this one; NaN if the number goes back.
   const count = (publisher, number) => {
     const last = known.get(publisher) ?? number - 1;
+    if (known.size > 1000) known.clear(); // most have ended
     known.set(publisher, number);
     return number > last ? number - last - 1 : NaN;
   };

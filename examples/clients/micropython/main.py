@@ -27,6 +27,8 @@ def watch(server, place, most):
     def count(publisher, number):
         """Return how many updates of a publisher are missing before this one; None if the number goes back."""
         last = known.get(publisher, number - 1)
+        if len(known) > 200:  # most have ended
+            known.clear()
         known[publisher] = number
         return number - last - 1 if number > last else None
 

@@ -66,7 +66,8 @@ def publish(server, place, words):
         server.send("WATCH", place.key, tag + ":ships", tag + ":lease")
         kind = server.send("TYPE", place.key)
         is_text = not server.has_json and kind == b"string" and server.send("GETRANGE", place.key, "0", "0") == b" "
-        check(kind in (b"none", b"ReJSON-RL") or is_text, f"{place.key} is a key of another program")
+        is_document = is_text or (server.has_json and kind == b"ReJSON-RL")
+        check(kind == b"none" or is_document, f"{place.key} is a key of another program")
         check(server.send("GET", tag + ":lease") is None, f"{place.key} is owned by another program")
         names = [it.decode() for it in server.send("SMEMBERS", tag + ":ships")] + [it[1] for it in parts]
         server.send("MULTI")

@@ -23,7 +23,9 @@ class Connection:
         scheme, _, rest = url.partition("://")
         check(scheme == "redis", "the URL is not like redis://[user:password@]host[:port]")
         account, _, address = rest.rpartition("@")
+        address, _, database = address.partition("/")
         host, _, port = address.partition(":")
+        check(database in ("", "0"), "this client uses database 0 only")
         self.received, self.messages = b"", []  # bytes that are not read yet; messages that are not handled yet
         self.socket = socket.socket()
         self.socket.settimeout(5)
@@ -31,9 +33,13 @@ class Connection:
         self.poll = select.poll()
         self.poll.register(self.socket, select.POLLIN)
         user, _, password = account.partition(":")
-        self.send("HELLO", "3", *(["AUTH", user or "default", password] if account else []))
-        # A server without the JSON module holds documents as text
-        self.has_json = not isinstance(self.send("JSON.TYPE", "_", refusals=True), Failure)
+        hello = self.send("HELLO", "3", *(["AUTH", user or "default", password] if account else []))
+        mode = hello[hello.index(b"mode") + 1] if b"mode" in hello else b"standalone"
+        check(mode == b"standalone", f"this is not a single server, but: {mode.decode()}")
+        kind = self.send("JSON.TYPE", "_", refusals=True)
+        self.has_json = not isinstance(kind, Failure)  # a server without the JSON module holds documents as text
+        is_unknown = self.has_json or str(kind).startswith("ERR unknown command")
+        check(is_unknown, f"the server refused JSON.TYPE: {kind}")
 
     def send(self, *words, confirmed=b"", refusals=False):
         """Send a command and return its reply; with `refusals` an error of the server is returned, not raised."""
@@ -43,7 +49,7 @@ class Connection:
         while True:
             is_push, found = self.next()
             if not is_push or found[0] == confirmed:
-                check(refusals or not isinstance(found, Failure), f"the server refused {words[0]}: {found}")
+                check(refusals or not isinstance(found, Failure), f"the server refused {words[0].decode()}: {found}")
                 return found
 
     def subscribe(self, channel):
@@ -94,6 +100,6 @@ class Connection:
         return whole[:count]
 
     def more(self):
-        piece = self.socket.recv(1 << 16)
+        piece = self.socket.recv(1 << 12)  # more at once would cut a small heap into pieces
         check(piece, "the server closed the connection")
         self.received += piece
