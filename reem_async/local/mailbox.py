@@ -99,8 +99,9 @@ class Mailbox:
         self, address: str, kind: bytes, channel: bytes, content: bytes = b"", memory: Descriptor | None = None
     ) -> None:
         """Send without waiting; raises OSError, which is a BlockingIOError if the receiver's queue is full."""
-        passed = [] if memory is None or not memory.is_own else [_DESCRIPTOR.pack(memory.number)]
-        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, each) for each in passed]
+        rights: list[tuple[int, int, bytes]] = []
+        if memory is not None and memory.is_own:
+            rights.append((socket.SOL_SOCKET, socket.SCM_RIGHTS, _DESCRIPTOR.pack(memory.number)))
         self._socket.sendmsg([_HEAD.pack(kind, len(channel)), channel, content], rights, 0, f"{self._folder}/{address}")
 
     def send(
@@ -123,7 +124,7 @@ class Mailbox:
                 size, ancillary, flags, _ = self._socket.recvmsg_into([buffer], _ANCILLARY, _CLOSE_ON_EXEC)
             except OSError:
                 return None
-            memory = _received(ancillary)  # closed unless it is returned
+            memory = _received(ancillary) if len(ancillary) > 1 else None  # closed unless it is returned
             users = [_CREDENTIALS.unpack(data)[1] for _, kind, data in ancillary if kind == socket.SCM_CREDENTIALS]
             if users == [os.getuid()] and size >= _HEAD.size and not flags & _TRUNCATED:
                 kind, length = _HEAD.unpack_from(buffer)

@@ -136,6 +136,8 @@ def in_slot(
 
 def sizes_of_parts(text: bytes, attachments: Sequence[EncodedAttachment]) -> list[int]:
     """Return the bytes of each part in a slot: the text of the document, then each attachment."""
+    if not attachments:  # most updates: without a generator
+        return [len(text)]
     return [len(text), *(sum([len(piece) for piece in each.blob or ()]) for each in attachments)]
 
 

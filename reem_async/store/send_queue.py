@@ -127,7 +127,7 @@ class SendQueue(Outage):
         # loop ends, is lost.
         state = self._session.transport.states.last.state
         away = self._reached != self._session.tasks.place or state != "connected"
-        out = self._out.setdefault(document, UnsentUpdates(writer, away=away))
+        out = self._out.get(document) or self._out.setdefault(document, UnsentUpdates(writer, away=away))
         dropped = out.put(it, merge=self._is_outage or _lags(out))
         while len(out.kept) > 1 and self._is_full:  # the newest always stays
             dropped += out.drop_first()
