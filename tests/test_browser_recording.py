@@ -1,18 +1,26 @@
 """A recording in the browser: the same pages, over the time it was made."""
 
 import asyncio
+import json
+import threading
+import time
 
+import httpx
 import numpy as np
 import pytest
 from browserkit import client_of, served
-from conftest import aeventually, python
+from conftest import PATIENCE, aeventually, eventually, python
+from recordkit import write_mixed
 
 import reem_async
 from reem_async.errors import ReadOnly
 from reem_async.plan.keys import keys_of
 from reem_async.server import EmbeddedServer
+from reem_async.tools.browser import logsource
 from reem_async.tools.browser.logsource import LogSource
 from reem_async.tools.recording import Recorder
+from reem_async.tools.recording.container import Container
+from reem_async.tools.recording.format import DamagedRecording
 
 pytest.importorskip("mcap", reason="mcap is not installed: pip install 'reem-async[tools]'")
 
@@ -94,6 +102,97 @@ def test_lost_updates_are_marked_in_series(ask, steps):
     part = ask.json("series", path="arm.q", start=steps[1], end=steps[3])
     assert (part["start"], part["end"], part["losses"]) == (steps[1], steps[3], [])
     assert part["lines"][0] == [2.0, 3.0, 4.0]
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    return write_mixed(tmp_path_factory.mktemp("mixed") / "run.mcap", 400)
+
+
+def test_what_no_page_waits_for_is_not_read_on_and_others_are_answered_meanwhile(mixed, monkeypatch):
+    content, read = Container.content, []
+
+    def slow(self, info):
+        read.append(info)
+        time.sleep(0.02)
+        return content(self, info)
+
+    with served(lambda: LogSource(mixed)) as (address, source), client_of(address) as ask:
+        chunks = len(source.log._container.every_chunk)
+        assert ask.rows("cam").keys() == {"t", "rgb"}
+        monkeypatch.setattr(Container, "content", slow)
+        with pytest.raises(httpx.ReadTimeout):
+            ask.http.get("/api/series", params={"path": "arm.n"}, timeout=0.3)
+        assert ask.rows("arm")["n"]["text"] == "399"
+        eventually(lambda: source.status().part == 1.0)
+        assert len(read) < chunks / 4
+        monkeypatch.setattr(Container, "content", content)
+        series = ask.json("series", path="arm.n")
+        assert (series["lines"][0][0], series["lines"][0][-1], source.status().part) == (0, 399, 1)
+
+
+def test_numbers_over_time_are_read_once_and_parts_of_them_as_they_are(mixed, monkeypatch):
+    with served(lambda: LogSource(mixed)) as (address, source), client_of(address) as ask:
+        start, end = source.log.start, source.log.end
+        part = ask.json("series", path="arm.n", start=start + 10.1, end=start + 11.1)
+        assert part["lines"] == [[40, 41, 42, 43, 44]]
+        assert part["times"][0] == start + 10.1, "with what was there already"
+        whole = ask.json("series", path="arm.n")
+        assert whole["lines"] == [list(range(400))]
+        vectors = ask.json("series", path="arm.q")
+        assert (vectors["names"][6], vectors["lines"][6][-1]) == ("[6]", 199.5)
+        counts = ask.json("activity", bins=10, path="arm")["counts"]
+        monkeypatch.setattr(Container, "content", None)
+        assert ask.json("series", path="arm.n", start=start + 10.1, end=start + 11.1) == part
+        assert ask.json("activity", bins=10, path="arm")["counts"] == counts
+        assert sum(counts) == 400
+        assert ask.json("series", path="arm.n", start=end + 5, end=end + 6)["lines"] == [[399]]
+        assert source._series[("arm", "q")].bytes == 400 * 8 * 8
+
+
+def test_the_page_is_there_before_a_long_file_is_open(mixed, tmp_path, monkeypatch):
+    """Its recorder was killed: it is read from record to record first."""
+    killed, go_on, opening = tmp_path / "killed.mcap", threading.Event(), logsource.open_log
+    killed.write_bytes(mixed.read_bytes()[:-100])
+
+    def slow(files, ships, progress):
+        def noted(done, every):
+            progress(done, every)
+            assert done < every / 2 or go_on.wait(PATIENCE)
+
+        return opening(files, ships, progress=noted)
+
+    monkeypatch.setattr(logsource, "open_log", slow)
+    monkeypatch.setattr(logsource, "_AT_ONCE", 0)
+    with served(lambda: LogSource(killed)) as (address, source), client_of(address) as ask:
+        eventually(lambda: 0.4 < source.status().part < 1)
+        with pytest.raises(httpx.ReadTimeout):
+            ask.http.get("/api/tree", params={"open": "100:0:"}, timeout=0.2)
+        with ask.http.stream("GET", "/api/events") as stream:
+            line = next(line for line in stream.iter_lines() if line.startswith("data: "))
+        assert json.loads(line[6:]) | {"paths": [], "part": 0} == {
+            "start": 0, "end": 0, "lost": "", "note": "", "part": 0, "paths": [], "more": False,
+        }  # fmt: skip
+        go_on.set()
+        assert ask.rows("arm")["n"]["text"] == "399"
+        assert "not ended properly" in ask.json("tree", open="100:0:")["note"]
+    go_on.clear()
+    source = LogSource(killed)
+    eventually(lambda: source.status().part < 1)
+
+    async def close():
+        closing = asyncio.create_task(source.close())
+        await asyncio.sleep(0)
+        go_on.set()
+        await closing
+
+    asyncio.run(close())
+    assert isinstance(source._opening.exception(), logsource._Closed), "a page that ends does not read on"
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"no recording")
+    monkeypatch.undo()
+    with pytest.raises(DamagedRecording):
+        LogSource(broken)
 
 
 def test_the_snippet_reads_that_very_instant(ask, steps):

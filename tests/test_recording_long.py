@@ -4,16 +4,14 @@ import os
 
 import numpy as np
 import pytest
+from recordkit import write_mixed
 
 from reem_async.plan.paths import parse
-from reem_async.ships.registry import Ships, default_ships
 from reem_async.tools.recording import open_log
 from reem_async.tools.recording.container import Container
 from reem_async.tools.recording.format import Kind, Role
 from reem_async.tools.recording.layout import to_json
 from reem_async.tools.recording.sink import Sink
-from reem_async.tools.recording.writer_thread import Operation, WriterThread
-from reem_async.transport.protocol import CommandRecorder
 
 KEYS, CHUNKS = 20, 400
 START, STEP = 1_700_000_000_000_000_000, 250_000_000
@@ -104,22 +102,7 @@ def test_what_the_index_says_is_what_there_is(file):
 
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory):
-    """Keys with a number and a picture in one dict, and others with numbers only; a flush for every four of them."""
-    file = tmp_path_factory.mktemp("mixed") / "run.mcap"
-    sink = Sink(file, "zstd", {}, overwrite=False)
-    sink.output.appear()
-    writer = WriterThread(sink, Ships(default_ships(), CommandRecorder), 0)
-    for step in range(40):
-        now = START + step * STEP
-        picture = np.full((100, 100), step, np.uint8)
-        writer._write(Operation(Role.UPDATE, ("cam",), {"t": step, "rgb": picture}, (now, now, step)))
-        joints = {"q": np.full(7, step / 2), "n": step, "mode": f"m{step}", "big": 2**60 + step, "a": [step] * 3}
-        writer._write(Operation(Role.UPDATE, ("arm",), joints, (now + 2000, now, step)))
-        if step % 4 == 3:
-            sink._closed_at -= 1
-            sink.tick()
-    sink.finish({})
-    return file
+    return write_mixed(tmp_path_factory.mktemp("mixed") / "run.mcap")
 
 
 def test_numbers_are_read_without_the_pictures_between_them(mixed, monkeypatch):
