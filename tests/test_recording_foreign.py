@@ -223,6 +223,8 @@ def test_messages_that_are_not_what_their_schema_says(ros, tmp_path, name):
         assert log["s.mode"].at(log.end) == 3
         assert "not cdr" in str(log.value_at("", log.start + 1)["s"])
     assert invoked("log", "export", str(path), "-o", str(tmp_path / "x.csv")).returncode == 1
+    checked = invoked("log", "info", path, "--verify")
+    assert (checked.returncode, "1 message cannot be decoded as its schema says" in checked.stdout) == (1, True)
 
 
 LACKING = FileDescriptorSet(file=[{"name": "a", "dependency": ["b"]}])
@@ -280,6 +282,19 @@ def test_huge_counts_take_no_memory(text):
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
+
+
+def test_big_endian_and_types_without_a_definition():
+    read = compiled("a/msg/B", "builtin_interfaces/Duration d\nint16[] x\ntime t\nHeader h\n" + HEADER)
+    found = plain(read(bytes(4) + struct.pack(">iIIhhiIiII2s", -5, 6, 2, -300, 7, 8, 9, 1, 2, 2, b"k\0")))
+    assert found == {
+        "d": {"sec": -5, "nanosec": 6},
+        "x": [-300, 7],
+        "t": {"sec": 8, "nanosec": 9},
+        "h": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "k"},
+    }
+    with pytest.raises(ValueError, match="not CDR: it begins with 00 07"):  # the second version of CDR
+        read(b"\0\7\0\0" + bytes(50))
 
 
 def test_messages_of_more_values_than_memory_holds():

@@ -189,7 +189,7 @@ def info(
                 emit_json(_summary(log, channels))
             else:
                 _print(log, channels)
-            return 1 if log.damaged else 0
+            return 1 if log.unreadable else 0
 
     run_local("log info", work)
 
@@ -204,6 +204,7 @@ def _summary(log: Log, channels: list[ChannelSummary]) -> dict[str, Any]:
         "duration": log.duration,
         "complete": log.indexed,
         "damaged": log.damaged,
+        "unreadable": log.unreadable,
         "gaps": [{"time": time, "path": path, "missed": missed} for time, path, missed in log.gaps()],
         "metadata": log.metadata,
         "channels": [asdict(each) | {"rate": each.rate} for each in channels],
@@ -217,6 +218,8 @@ def _size(log: Log) -> int:
 def _print(log: Log, channels: list[ChannelSummary]) -> None:
     metadata = log.metadata
     damage = f"; {log.damaged} records are damaged or missing" if log.damaged else ""
+    if log.unreadable > log.damaged:
+        damage += f"; {counted(log.unreadable, 'message')} cannot be decoded as its schema says"
     complete = "complete" if log.indexed else "not ended properly: the last second may be missing"
     # First what was recorded, then what REEM notes of it.
     order = sorted(channels, key=lambda each: each.topic.startswith("/_reem"))

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import BadType, BadValue, MissingKey
 from ...plan.arguments import check_number
-from ...plan.paths import Path, parse, parse_pattern, shorten, show
+from ...plan.paths import Path, Pattern, parse, parse_pattern, shorten, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
 from ...ships.base import SpecialDatatypeShip
@@ -509,9 +509,13 @@ class Log:
         """Read all of the file; return how many records are damaged.
 
         Checksums, indexes and the count of messages are compared with the data. `progress` is called with the chunks
-        done and all of them.
+        done and all of them. Messages of other programs are decoded, and `unreadable` counts those that cannot be.
         """
-        return self._container.verify(progress)
+        self._container.verify(progress)
+        for name in set(self._past.foreign.keys.values()):
+            for _ in self._past.updates(-1, _END, [Pattern(name)]):
+                pass
+        return self._container.damaged
 
     def close(self) -> None:
         """Close the file. Idempotent."""
