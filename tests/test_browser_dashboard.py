@@ -214,6 +214,7 @@ def test_plots_zoom_together_share_a_cursor_and_take_other_keys(visit, address, 
     expect(plots).to_have_count(2)
     everything = page.get_by_role("button", name="Show all of it again")
     expect(everything).to_have_count(0)
+    expect(plots.nth(0)).to_be_visible()
     box = plots.nth(0).bounding_box()
     plots.nth(0).hover(position={"x": box["width"] - 20, "y": 50})
     expect(legends.nth(1)).to_have_text(re.compile(r"-?\d"))  # the cursor is in all plots
@@ -234,6 +235,10 @@ def test_plots_zoom_together_share_a_cursor_and_take_other_keys(visit, address, 
     for _ in range(2):
         expect(page.get_by_role("button", name="Logarithmic axis")).to_have_attribute("aria-pressed", "true")
         page.reload()
+    page.get_by_role("button", name="Draw another key in this plot").click()
+    page.get_by_label("Key to draw in this plot").fill("nothing.here")
+    page.keyboard.press("Enter")
+    expect(page.locator("#toast")).to_have_text("No numbers at nothing.here")
     page.get_by_role("button", name="Draw another key in this plot").click()
     page.get_by_label("Key to draw in this plot").fill(f"{key()}.x")
     page.keyboard.press("Enter")

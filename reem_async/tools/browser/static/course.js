@@ -3,6 +3,7 @@ import { Plot } from "./plot.js";
 import { el, getJson, suggest, toast } from "./util.js";
 
 const MOST_KEYS = 8; // in one plot
+const NONE = { names: [""], times: [], lines: [[]] }; // of a key that is not there: it can be taken out of a plot
 const SETTLED = 150; // ms without another step of zooming until the part that is shown is read
 
 // What all plots over time have in common: the part of it that they show, and the instant under the pointer.
@@ -84,10 +85,11 @@ export class Course {
     box.focus();
   }
 
-  add(key) {
+  async add(key) {
     if (!key || key === this.address || this.others.includes(key)) return undefined;
     if (this.others.length + 1 >= MOST_KEYS) return toast(`${MOST_KEYS} keys are in this plot: take one out first`);
-    return this.keep([...this.others, key]);
+    const { lines, message } = await getJson("series", { path: key }).catch((error) => error);
+    return lines?.length ? this.keep([...this.others, key]) : toast(message ?? `No numbers at ${key}`);
   }
 
   keep(keys) {
@@ -112,12 +114,9 @@ export class Course {
     const { app, others } = this, [start, end] = app.axis.read;
     const get = (path) => getJson("series", { path, start, end: app.axis.follows ? null : end }, signal);
     const ask = (path) => app.config.live ? get(path) : inTurn(() => get(path));
-    const [first, ...more] = await Promise.all([ask(this.address), ...others.map((path) => ask(path).catch((error) => { if (!error.status) throw error; return { names: [], times: [], lines: [] }; }))]);
+    const [first, ...more] = await Promise.all([ask(this.address), ...others.map((path) => ask(path).catch((error) => { if (!error.status) throw error; return NONE; }))]);
     if (key !== this.wanted) return;
-    const missing = others.filter((_, index) => !more[index].lines.length);
-    if (missing.length && this.told !== `${missing}`) toast(`No numbers at ${missing.join(", ")}`);
-    this.told = `${missing}`;
-    this.data = others.length ? [first, ...more].map((each, index) => ({ ...each, key: index ? others[index - 1] : this.address })) : first;
+    this.data = others.length ? [first, ...more].map((each, index) => ({ ...(each.lines.length || !index ? each : NONE), key: index ? others[index - 1] : this.address })) : first;
   }
 
   draw() {

@@ -1,5 +1,4 @@
 // Zooming and panning a plot: wheel, dragging, two fingers, keys, and the buttons above it.
-import { BOTTOM } from "./plot.js";
 import { el } from "./util.js";
 
 const MOVED = 5; // px after which a press is a drag, and no click
@@ -57,7 +56,7 @@ export class Gestures {
   onDown(event) {
     const { plot } = this, { canvas } = plot, box = canvas.getBoundingClientRect();
     this.pointers.set(event.pointerId, event.clientX);
-    const touch = event.pointerType === "touch", axis = event.clientY > box.bottom - BOTTOM;
+    const touch = event.pointerType === "touch", axis = event.clientY > box.bottom - plot.bottom;
     const pans = touch || axis || event.shiftKey || event.button === 1;
     if (event.button === 1) event.preventDefault();
     this.drag = { x: event.clientX, at: plot.xAt(event.clientX), window: [plot.x0, plot.x1], width: box.width - plot.left, moved: false, pans, fingers: [...this.pointers.values()] };

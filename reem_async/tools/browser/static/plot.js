@@ -4,7 +4,7 @@ import { clockText, el, numberText, setText } from "./util.js";
 
 const LEAST_SPAN = 5e-13; // of the numbers: the least part of them that an axis shows
 const NARROW = 40;
-export const RIGHT = 12, TOP = 10, BOTTOM = 24; // px around the curves
+const RIGHT = 12, TOP = 10, BOTTOM = 24; // px around the curves
 const CLOSE = 5; // px from a mark within which the pointer is on it
 const SILENCE = 0.5; // s of no update that are marked, beside a loss
 
@@ -90,7 +90,7 @@ export class Plot {
     this.pointed = null; // the x under the pointer
     this.cursor = null;
     this.selection = null; // what is being dragged over, to zoom in on it
-    this.left = NARROW;
+    [this.left, this.bottom] = [NARROW, BOTTOM]; // px, of which the axes take
     new ResizeObserver(() => this.draw()).observe(this.canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
     this.gestures = new Gestures(this);
