@@ -1,12 +1,13 @@
 """`kvs.raw`: keys of programs without REEM, as these wrote them."""
 
+import asyncio
 import contextlib
 import os
 
 import numpy as np
 import pytest
 import redis
-from conftest import Loop, assert_same, eventually, url_of_user
+from conftest import PATIENCE, Loop, assert_same, eventually, url_of_user
 
 import reem
 from reem.errors import (
@@ -229,6 +230,24 @@ def test_many_keys_are_bounded_and_a_warning_says_so(watching, front, raw, key, 
     while (update := watch.next()).value != "new":
         assert update.initial
     assert not update.initial
+
+
+async def test_what_changes_does_not_wait_for_thousands_that_were_found(akvs, raw, key):
+    for number in range(2000):
+        raw.set(key(f"k{number}"), number)
+    seen = {}
+    watch = raw_watch.RawWatch(akvs.interface.session, [key("*")], Last(10_000), 1000, pace=0.2)
+    async with watch, asyncio.timeout(PATIENCE):
+        for number in (0, 1000, 1999):
+            raw.set(key(f"k{number}"), "new")
+        while [each.value for each in seen.values()].count("new") < 3:
+            update = await watch.next()
+            seen[update.path] = update
+        assert len(seen) < 1000
+        while len(seen) < 2000:
+            update = await watch.next()
+            seen[update.path] = update
+    assert all(update.initial for update in seen.values() if update.value != "new")
 
 
 def test_nothing_is_changed_by_looking(server):

@@ -43,6 +43,7 @@ _LOOK = 0.005  # seconds between two looks whether it has caught up
 _QUICKEST = 0.001  # seconds between two readings; a key that changes at any rate is read 1,000 times a second at most
 _LONGEST_PAUSE = 0.5  # seconds between tries to connect
 _AT_ONCE = 64  # keys that are read together
+_MOST_CHANGED = 48  # of these, keys that were changed, while others that a search has found wait
 _SLOW = 1 << 16  # bytes of a value from which its key waits for its next reading, by `rate`
 _DOCUMENT_SECONDS = 5.0  # for which a key that held a document of REEM is taken to hold one still
 _DOCUMENT_REST = 60.0  # the same, while no other program's key was found
@@ -117,6 +118,11 @@ class RawWatch(Stream[RawUpdate]):
     def _following(self) -> bool:
         return self.is_begun or self._closed
 
+    @property
+    def is_partial(self) -> bool:
+        """Whether there were more keys than are read at the beginning: the others are reported when they change."""
+        return self._follower is not None and self._follower.is_partial
+
     def limit_rate(self, rate: float) -> None:
         """Have at most so many bytes a second read of each key from now on, once it has begun."""
         if self._follower is not None:
@@ -127,7 +133,7 @@ class RawWatch(Stream[RawUpdate]):
         follower = self._follower
         if follower is None:
             return
-        turn = follower.turns + follower.waiting // _AT_ONCE + 2
+        turn = follower.turns + follower.waiting // (_AT_ONCE - _MOST_CHANGED) + 2
         for _ in range(int(seconds / _LOOK)):
             if self.queue.is_empty and (not follower.waiting or follower.turns >= turn):
                 return
@@ -216,6 +222,7 @@ class _Follower:
         self._next_look = 0.0
         self._is_first = True
         self.turns = 0  # how often keys were read
+        self.is_partial = False  # there are more keys than are read at the beginning
         self._reading = 0
         self._warned: set[str] = set()
 
@@ -289,6 +296,7 @@ class _Follower:
                 self._mark(names, is_first)
                 found += len(names)
                 if found > MOST:
+                    self.is_partial = True
                     self._warn(
                         f"{glob.top} names more than {MOST} keys of other programs: the others are reported when they "
                         "change; a narrower pattern reports all of its keys"
@@ -344,7 +352,10 @@ class _Follower:
             self._next_look = loop.time() + _PERIOD
             await self.connect()
         now = loop.time()
-        names = list(islice((name for name in self._dirty if self._rests.get(name, 0.0) <= now), _AT_ONCE))
+        # Keys that were changed do not wait for those that a search has found, of which there may be thousands.
+        changed = self._due(_AT_ONCE, is_changed=True)
+        found = self._due(_AT_ONCE - min(len(changed), _MOST_CHANGED), is_changed=False)
+        names = changed[: _AT_ONCE - len(found)] + found
         if names:
             self._reading = len(names)
             try:
@@ -352,13 +363,19 @@ class _Follower:
             finally:
                 self._reading = 0
                 self.turns += 1
-            await asyncio.sleep(self._pace)
+            await asyncio.sleep(self._pace if changed else min(self._pace, loop.time() - now))
             return
         self._news.clear()
         wake = min([self._next_look, *(self._rests.get(name, 0.0) for name in self._dirty)])
         with suppress(TimeoutError):
             async with asyncio.timeout_at(wake):
                 await self._news.wait()
+
+    def _due(self, most: int, *, is_changed: bool) -> list[str]:
+        """Return keys that may be read now: such as the server has named, or such as only a search has found."""
+        now = asyncio.get_running_loop().time()
+        wanted = (it for it, count in self._dirty.items() if (count > 1 or it not in self._found) is is_changed)
+        return list(islice((name for name in wanted if self._rests.get(name, 0.0) <= now), most))
 
     async def _read(self, names: list[str]) -> None:
         counts = {name: self._dirty.pop(name) for name in names}  # first: what changes from now on is read again

@@ -94,8 +94,8 @@ class LiveSource:
             notes.append(f"{self._follower.monitor.dropped} updates came too fast to be kept")
         if not self._follower.hears_of_changes:
             notes.append(_UNTOLD)
-        if self._raw.refused:
-            notes.append(self._raw.refused)
+        if self._raw.note:
+            notes.append(self._raw.note)
         end = self.history.clock.now()
         return Status(
             min(max(self.history.start, end - self.history.seconds), end), end, self._follower.lost, "; ".join(notes)

@@ -20,7 +20,7 @@ from ...plan.paths import Path, check_top_key, show
 from ...plan.placeholders import Unfetched
 from ...plan.raw import RawValue, read
 from ...plan.trees import MISSING, get, walk
-from ...pubsub.raw_watch import RawUpdate, RawWatch
+from ...pubsub.raw_watch import MOST, RawUpdate, RawWatch
 from ...pubsub.refresh import BACKGROUND_RATE
 from ...session import Session
 from .follower import UNSEEN
@@ -78,7 +78,7 @@ class RawFollower:
 
     def __init__(self, session: Session, history: History) -> None:
         self.kinds: dict[str, str] = {}  # the keys, with their Redis types
-        self.refused = ""  # why there are none, if the user may not look
+        self._refused = ""  # why there are none, if the user may not look
         self._session, self._history = session, history
         self._hints: dict[Path, Hint] = {}
         # When each key was read lately, and how many changes that were: more than the buffer has
@@ -92,10 +92,17 @@ class RawFollower:
         try:
             await self._watch.listen()
         except NotAllowed as error:
-            self.refused = f"keys of programs without REEM are not shown: {error}"
+            self._refused = f"keys of programs without REEM are not shown: {error}"
         else:
             self.shown_on(0)
             self._task = asyncio.create_task(self._follow())
+
+    @property
+    def note(self) -> str:
+        """What a page says of keys that it does not show."""
+        if self._watch.is_partial:
+            return f"of keys of programs without REEM {MOST} are shown, and others once they change"
+        return self._refused
 
     def shown_on(self, pages: int) -> None:
         self._watch.limit_rate(BACKGROUND_RATE * (1 if pages else UNSEEN))
@@ -111,7 +118,7 @@ class RawFollower:
             async for update in self._watch:
                 await self._take(update)
         except NotAllowed as error:
-            self.refused = f"keys of programs without REEM are not shown: {error}"
+            self._refused = f"keys of programs without REEM are not shown: {error}"
 
     async def find(self, name: str) -> bool:
         """Have the buffer know a key that was stored just now; return whether it is of another program."""

@@ -14,7 +14,7 @@ from ...connection import RedisInterface
 from ...errors import BadKey, MissingKey, WrongType
 from ...plan.keys import DOCUMENT
 from ...plan.paths import Path, Pattern, parse, parse_pattern
-from ...plan.raw import LARGEST, RawValue, read
+from ...plan.raw import LARGEST, RawValue, fetched, read
 from ...plan.trees import MISSING, get
 from ...session import Session
 from ...store.catalog import Outline, outlined
@@ -33,7 +33,7 @@ async def raw_at(interface: RedisInterface, text: str, largest: float = LARGEST)
     """Return where a typed path leads to in a key of another program, and what is there; None if there is no such key.
 
     The text may be the whole key, which may have dots in it, or a path as those of REEM. Raises MissingKey if there is
-    such a key, and nothing at the path.
+    such a key, and nothing at the path; and TooLarge, if the key is too large to look into.
     """
     if interface.namespace or not text:
         return None
@@ -42,11 +42,14 @@ async def raw_at(interface: RedisInterface, text: str, largest: float = LARGEST)
         paths.append(parse(text))
     is_there = False
     for path in dict.fromkeys(filter(None, paths)):
-        it: RawValue = await interface.session.run(read(str(path[0]), largest))
+        name, rest = str(path[0]), path[1:]
+        it: RawValue = await interface.session.run(read(name, LARGEST if rest else largest))
         if it.kind in ("none", DOCUMENT):
             continue
         is_there = True
-        if (value := get(it.value, path[1:])) is not MISSING:
+        if rest:
+            fetched(name, it, LARGEST)  # raises TooLarge
+        if (value := get(it.value, rest)) is not MISSING:
             return path, RawValue(it.kind, value, it.size)
     if is_there:
         raise MissingKey(f"nothing is stored at {text}")

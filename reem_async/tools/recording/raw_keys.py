@@ -79,17 +79,19 @@ class RawRecorder:
             check_top_key(update.path)
         except BadKey:  # a brace: no path of a recording leads there
             return
+        size = update.size
         if update.deleted:
             self.names.pop(update.path, None)
             value = MISSING
         else:
             self.names[update.path] = None
             if isinstance(value, Unfetched):
+                size = 0
                 value = Unreadable(update.path, f"{value.size} bytes: of another program {LARGEST} are recorded")
             value = pruned(value, path, owner.patterns)
         role = Role.STORED if update.origin == "stored" else Role.STATE
         kind = Kind.STORED if role == Role.STORED else Kind.READ
-        owner.writer_thread.put(Operation(role, path, value, self._stamp(), kind), update.size)
+        owner.writer_thread.put(Operation(role, path, value, self._stamp(), kind), size)
 
     def keyframe(self, number: int) -> None:
         stamp = self._stamp(number)
