@@ -533,9 +533,10 @@ def test_boxes_are_drawn_over_a_picture_by_a_hint_that_is_typed_once(visit, pspa
     expect(drawn).to_be_visible()
     eventually(lambda: drawn.evaluate(inked)[0] or page.wait_for_timeout(50))
     page.goto(f"{visit.address}/view/{key()}.image")
-    page.get_by_label("Overlay").fill("nothing.here")
+    page.get_by_label("Overlay").fill(f"nothing.here; {key()}.boxes")
     page.keyboard.press("Enter")
     expect(page.locator("#view .card .wrong")).to_contain_text("nothing.here")
+    expect(drawn).to_be_visible()
 
 
 @pytest.mark.long

@@ -241,13 +241,18 @@ class Arrays:
     async def overlay(self, request: Request) -> Response:
         """Return the boxes and points that a hint names, each with its label and the number of its part of the hint."""
         shapes: list[Any] = []
+        wrong: list[str] = []  # to a page that follows keys, it is no error that one of them is not there
         try:
-            for part, hint in enumerate(hints_of(request.query_params.get("hint", ""))):
+            hints = hints_of(request.query_params.get("hint", ""))
+        except BadInput as error:
+            return reply({"shapes": [], "wrong": visible(str(error))})
+        for part, hint in enumerate(hints):
+            try:
                 value = (await self._source.value(hint.path, at_of(request))).value
                 shapes += [(*shape, part, hint.relative) for shape in shapes_of(hint, value)]
-        except (MissingKey, NotKept, BadData, BadInput) as error:  # to a page that follows keys, that is no error
-            return reply({"shapes": shapes, "wrong": visible(str(error))})
-        return reply({"shapes": shapes, "wrong": ""})
+            except (MissingKey, NotKept, BadData, BadInput) as error:
+                wrong.append(visible(str(error)))
+        return reply({"shapes": shapes, "wrong": "; ".join(wrong)})
 
     async def bytes(self, request: Request) -> Response:
         """Return the beginning of bytes in hexadecimal, and whether they are a picture."""

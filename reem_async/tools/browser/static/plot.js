@@ -303,6 +303,7 @@ export class Plot {
     const words = [seen("losses") && "▼ updates were lost", seen("quiet") && "┄ no update came: the last value", this.below > 0 && `${this.below} numbers of 0 and less have no place on a log axis`];
     setText(this.note, words.filter(Boolean).join(" · "));
     this.note.hidden = !this.note.textContent;
+    this.note.classList.toggle("lossy", seen("losses"));
   }
 
   readout() {
