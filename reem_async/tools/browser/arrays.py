@@ -246,10 +246,10 @@ class Arrays:
             hints = hints_of(request.query_params.get("hint", ""))
         except BadInput as error:
             return reply({"shapes": [], "wrong": visible(str(error))})
-        for part, hint in enumerate(hints):
+        for number, hint in enumerate(hints):
             try:
                 value = (await self._source.value(hint.path, at_of(request))).value
-                shapes += [(*shape, part, hint.relative) for shape in shapes_of(hint, value)]
+                shapes += [(*shape, number, hint.relative) for shape in shapes_of(hint, value)]
             except (MissingKey, NotKept, BadData, BadInput) as error:
                 wrong.append(visible(str(error)))
         return reply({"shapes": shapes, "wrong": "; ".join(wrong)})
