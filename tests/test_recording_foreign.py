@@ -452,7 +452,7 @@ async def test_files_of_reem_and_of_others(ros, ainterface, key, tmp_path):
         assert [row for row in rows_of(log) if row[3].startswith(name)] == rows_of(own)
         assert plain(log[name].at(log.end)) == plain(own[name].at(own.end))
         assert plain(log["arm/state"].at(log.end)) == state(9)
-        assert log.metadata["host"] == own.metadata["host"]
+        assert (log.metadata["host"], log.metadata["profile"]) == (own.metadata["host"], "ros2")
         assert {each.role for each in log.channels()} > {"update", "keyframe"}
 
 

@@ -67,9 +67,12 @@ class _Message:
     def rest(self) -> int:
         return len(self._data) - self._position
 
-    def spend(self, values: int) -> None:
-        self._left -= values
-        if self._left < 0:
+    def spend(self) -> None:
+        self.foresee(1)
+        self._left -= 1
+
+    def foresee(self, values: int) -> None:
+        if values > self._left:
             raise ValueError(f"it holds over {_MOST_VALUES} values")
 
     def _align(self, size: int) -> None:
@@ -93,6 +96,7 @@ class _Message:
         return count
 
     def check(self, count: int, least: int) -> None:
+        """Raise ValueError if there cannot be so many items."""
         if count * least > self.rest:
             raise ValueError(f"{count} items should follow, in {max(self.rest, 0)} bytes")
 
@@ -109,7 +113,7 @@ class _Message:
         return found
 
     def text(self) -> str:
-        self.spend(1)
+        self.spend()
         length = self.count(1)
         start = self._position
         self.skip(length)
@@ -190,14 +194,14 @@ def _type_of(name: str, texts: dict[str, str], known: dict[str, _Type], outer: t
 
 
 def _nothing(message: _Message) -> dict[str, Any]:
-    message.spend(1)
+    message.spend()
     message.skip(1)
     return {}
 
 
 def _reading(fields: tuple[tuple[str, _Read], ...]) -> _Read:
     def read(message: _Message) -> dict[str, Any]:
-        message.spend(1)
+        message.spend()
         return {name: each(message) for name, each in fields}
 
     return read
@@ -230,7 +234,7 @@ def _field(
         else:
             count = fixed
             message.check(count, item.least)
-        message.spend(1)
+        message.foresee(count)
         return [item.read(message) for _ in range(count)]
 
     return _Type(read, 4 if fixed is None else fixed * item.least)

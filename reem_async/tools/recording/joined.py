@@ -133,7 +133,8 @@ class Joined:
         return file.unpacked_size(own)
 
     def header(self) -> dict[str, str]:
-        return self.files[0].header()
+        others = [file for file in self.files if not any(record.name == "reem" for record in file.metadata)]
+        return others[0].header() if others else {}
 
     def verify(self, progress: Progress | None = None) -> int:
         done, total = 0, len(self.every_chunk)
