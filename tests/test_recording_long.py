@@ -1,15 +1,18 @@
 """Long recordings of many keys: what is asked of one does not read all of it."""
 
+import contextlib
 import os
+import random
 
 import numpy as np
 import pytest
+from conftest import sized
 from recordkit import write_mixed
 
 from reem_async.plan.paths import parse
 from reem_async.tools.recording import open_log
 from reem_async.tools.recording.container import Container
-from reem_async.tools.recording.format import Kind, Role
+from reem_async.tools.recording.format import DamagedRecording, Kind, Role
 from reem_async.tools.recording.layout import to_json
 from reem_async.tools.recording.sink import Sink
 
@@ -132,6 +135,26 @@ def test_numbers_are_read_without_the_pictures_between_them(mixed, monkeypatch):
     with open_log(mixed) as log:
         assert [value["rgb"][0, 0] for _, value in log["cam"].values()] == list(range(40))
         assert log.verify() == 0
+
+
+def test_a_damaged_history_has_what_following_each_change_has(mixed, tmp_path):
+    """All of it; and more if only the index of other channels is damaged, which is not read."""
+    damaged, data, found = tmp_path / "damaged.mcap", mixed.read_bytes(), 0
+    for seed in range(sized(25, 300)):
+        rng, changed = random.Random(seed), bytearray(data)
+        for _ in range(rng.choice((1, 3))):
+            changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        damaged.write_bytes(changed)
+        for path in (("cam", "t"), ("arm", "q")):
+            # The same changes one by one, in a log that was just opened, as the first must not know of the damage.
+            with contextlib.suppress(DamagedRecording), open_log(damaged) as log, open_log(damaged) as other:
+                changes = other._past.following(path, -1, 2**63 - 1)
+                slow = [(refs[0].time, np.array(value).tolist()) for refs, repeats, value in changes if not repeats]
+                quick = [(at, np.array(each).tolist()) for at, each, _ in log._past.values(path, -1, 2**63 - 1)]
+                assert quick == slow or (len(quick) == 40 and log.damaged < other.damaged), seed
+                assert all(value == (step := (at - START) // STEP) or value == [step / 2] * 7 for at, value in quick)
+                found += len(slow) < 40
+    assert found > 3
 
 
 def test_wherever_a_recording_ends_a_number_has_its_picture(mixed, tmp_path):

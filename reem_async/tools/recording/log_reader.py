@@ -350,19 +350,22 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                     yield times, trees, True
                     continue
             rows = zip(batch.times.tolist(), batch.channels.tolist(), batch.offsets.tolist(), strict=True)
-            for time, channel, offset in rows:
+            is_sound = True
+            for at, channel, offset in rows:
                 stream = self.of_channel[channel]
-                try:
-                    whole = self._load(Ref(time, batch.chunk, offset, channel), stream)
-                except (_FoundDamage, BadData):
-                    return at, last
+                whole = self._readable(Ref(at, batch.chunk, offset, channel), stream)
+                if whole is _DAMAGED:
+                    is_sound = False
+                    continue
                 tree = self._inside(whole, path[len(stream.path) :])
                 # See `following`.
                 repeats = stream.role in (Role.STATE, Role.KEYFRAME) and tree is not MISSING and last is not MISSING
                 repeats = repeats and same(tree, last)
-                at, last = time, tree
+                last = tree
                 if not repeats:
-                    yield [time], [tree], False
+                    yield [at], [tree], False
+            if not is_sound:  # keyframes are news from now on
+                return at, last
         return None
 
     def _reader(self, channel: int, path: Path) -> PathReader | None:
