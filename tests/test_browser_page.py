@@ -2,12 +2,17 @@
 
 # ruff: noqa: F811 - fixtures are named as arguments
 import re
+import threading
 import time
 
 import numpy as np
 import pytest
-from conftest import eventually
+from browserkit import served
+from conftest import PATIENCE, eventually
 from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
+from recordkit import write_mixed
+
+from reem_async.tools.browser import logsource
 
 expect = playwright.expect
 
@@ -166,6 +171,38 @@ def test_dragging_the_slider_shows_the_past(visit, pspace, key):
 
 def when(page, name):
     return page.evaluate("async (path) => (await (await fetch('/api/node?path=' + path)).json()).time", f"{name}.mode")
+
+
+@pytest.mark.long
+def test_the_page_of_a_recording_is_at_work_while_the_file_is_opened_and_read(visit, tmp_path, monkeypatch):
+    go_on, opening = threading.Event(), logsource.open_log
+
+    def slow(files, ships, progress):
+        progress(1, 2)
+        assert go_on.wait(PATIENCE)
+        return opening(files, ships, progress=progress)
+
+    monkeypatch.setattr(logsource, "open_log", slow)
+    monkeypatch.setattr(logsource, "_AT_ONCE", 0)
+    file = write_mixed(tmp_path / "run.mcap", 400)
+    with served(lambda: logsource.LogSource(file)) as (address, _):
+        page = visit.open("/view/arm.n", address)
+        expect(page.locator("#reading")).to_have_attribute("max", "1")
+        expect(page.locator("#reading")).to_be_visible()
+        expect(page.locator("#reading")).to_have_js_property("value", 0.5)
+        page.locator("#slider").click()
+        expect(page.locator("#clock")).to_have_text("no recording")
+        go_on.set()
+        expect(page.locator(".big")).to_have_text("399")
+        expect(row(page, "arm.n")).to_contain_text("399")
+        expect(page.locator("#reading")).to_be_hidden()
+        expect(page.locator("canvas.plot").first).to_be_visible()
+        box = page.locator("#slider").bounding_box()
+        page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        expect(page.locator(".big")).to_have_text(re.compile(r"^(199|200|201)$"))
+        expect(page.locator("#clock")).to_contain_text("of 99.75 s")
+        for context in visit.contexts:
+            context.close()
 
 
 @pytest.mark.long
