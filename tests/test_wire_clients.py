@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -47,7 +48,7 @@ def pairs(*quick, of=PAIRS):
 
 
 IN_C = pytest.mark.parametrize("pair", pairs("c json"), indirect=True)
-HOSTILE = pytest.mark.parametrize("pair", pairs("c plain", of=PAIRS[1::2]), indirect=True)
+ONLY_PLAIN = pytest.mark.parametrize("pair", pairs("c plain", of=PAIRS[1::2]), indirect=True)
 
 
 @pytest.fixture(params=pairs("c json", "javascript plain", "micropython json"))
@@ -308,6 +309,43 @@ def test_a_client_calls_a_service(client, url, key, name):
         assert "no program serves this" in meanwhile(refused, place, "goal=2", "start=0,1")
 
 
+@pytest.mark.long
+@ONLY_PLAIN
+def test_writers_and_readers_at_once_leave_whole_values(client, url, key):
+    """A client and Python replace a key with ever other arrays; no reader sees values of two, and no array is left."""
+    end, seen = time.monotonic() + 5, []
+
+    def publish(number):
+        names = "abc"[: number % 4]
+        assert (
+            run(client, url, "publish", key(), f"n={number}", *(f"{it}={number},{number}" for it in names)).returncode
+            == 0
+        )
+
+    def write():
+        with contextlib.closing(FRONTS["blocking"](url, "PublishSpace")) as space:
+            for number in range(10_000):
+                space.write([key()], {"n": -number} | {it: np.full(2, -number) for it in "abc"[: number % 4]})
+                time.sleep(0.005)
+                if time.monotonic() > end:
+                    return
+
+    def fits(value):
+        return all(set(each["data"]) == {value["n"]} for it, each in value.items() if it != "n")
+
+    with contextlib.closing(FRONTS["blocking"](url)) as front, ThreadPoolExecutor(2) as threads:
+        front.write([key()], {"n": 0})
+        works = [threads.submit(write), threads.submit(lambda: [publish(number) for number in range(1, 9)])]
+        while not all(work.done() for work in works):
+            seen += [as_shown(front.read([key()])), result(client, url, "get", key())]
+        for work in works:
+            work.result()
+        assert all(map(fits, seen))
+        assert len({value["n"] for value in seen}) > 5
+        left = {f"{{{key()}}}.{it}" for it in front.read([key()]) if it != "n"}
+    assert set(keys_of(url, key())) - {f"{{{key()}}}:last", f"{{{key()}}}:ships"} == left
+
+
 # --- hostile bytes
 
 
@@ -343,7 +381,7 @@ TEXTS = [
 ]
 
 
-@HOSTILE
+@ONLY_PLAIN
 def test_bytes_that_are_no_value_are_an_error_and_no_crash(client, plain_url, key):
     with contextlib.closing(redis.Redis.from_url(plain_url)) as raw:
         for number, blob in enumerate(sized(BLOBS[::4], BLOBS)):
@@ -402,7 +440,7 @@ REPLIES = [
 ]
 
 
-@HOSTILE
+@ONLY_PLAIN
 def test_truncated_and_hostile_replies_are_an_error_and_no_crash(client):
     for number, reply in enumerate(sized(REPLIES[::3], REPLIES)):
         for words in sized([("get", "watch", "publish", "call")[number % 4]], ["get", "watch", "publish", "call"]):
@@ -444,10 +482,12 @@ LINES = [
     b'[1,5,5,0,[],"set",1,[]]\n1',
     b'[1,%p,5,0,[],"set",25,[["numpy",".a",3]]]\n"$ship numpy .a 1 uint8[1]"abc',
     b'[1,%p,"x",0,[],"set",1,[]]\n1',
+    b'[1,%p,5,0,[],"other",1,[]]\n1',
+    b"[1,%p,5,0,[],7,1,[]]\n1",
 ]
 
 
-@HOSTILE
+@ONLY_PLAIN
 def test_a_notice_that_is_none_ends_a_watch_with_an_error(client, plain_url, key):
     with contextlib.closing(redis.Redis.from_url(plain_url)) as raw:
         for line in sized(LINES[::3], LINES):
@@ -472,7 +512,7 @@ ANSWERS = [
 ]
 
 
-@HOSTILE
+@ONLY_PLAIN
 def test_an_answer_that_is_none_is_an_error(client, plain_url, key):
     server = "0123456789abcdef"
     with contextlib.closing(redis.Redis.from_url(plain_url)) as raw, contextlib.closing(raw.pubsub()) as requests:

@@ -40,11 +40,15 @@ typedef struct { char *data; size_t size; } Text; // a zero follows the bytes; d
 static void *kept[1 << 20];
 static size_t kept_count;
 
+static void *keep(void *data) {
+    if (data == NULL || kept_count == sizeof kept / sizeof *kept) fail("there is no memory");
+    return kept[kept_count++] = data;
+}
+
 static Text room(size_t size) {
-    char *data = malloc(size + 1);
-    if (data == NULL || kept_count == sizeof kept / sizeof *kept) fail("there is no memory for %zu bytes", size);
-    data[size] = 0;
-    return (Text){kept[kept_count++] = data, size};
+    Text it = {keep(malloc(size + 1)), size};
+    it.data[size] = 0;
+    return it;
 }
 
 static void forget(void) {
@@ -57,8 +61,7 @@ static Text text_of(const char *form, ...) {
     char *data;
     int size = vasprintf(&data, form, list);
     va_end(list);
-    if (size < 0 || kept_count == sizeof kept / sizeof *kept) fail("there is no memory");
-    return (Text){kept[kept_count++] = data, (size_t)size};
+    return (Text){keep(size < 0 ? NULL : data), (size_t)size};
 }
 
 static Text joined(Text one, Text other) {
@@ -147,7 +150,7 @@ static Reply next_reply(int depth) {
         if ((at & (at + 1)) == 0 && !(it.items = realloc(it.items, 2 * (size_t)(at + 1) * sizeof item))) fail("no memory");
         it.items[at] = item;
     }
-    kept[kept_count++] = it.items;
+    if (it.items != NULL) keep(it.items);
     return it;
 }
 
@@ -156,6 +159,7 @@ static Reply next_frame(void) {
     if (it.kind == '>' && it.number == 3 && is(it.items[0].text, "message") && it.items[2].text.data) {
         if (message_count == MOST) fail("there are more than %d messages that wait", MOST);
         Text payload = it.items[2].text, copy = {malloc(payload.size + 1), payload.size};
+        if (copy.data == NULL) fail("there is no memory");
         memcpy(copy.data, payload.data, payload.size + 1);
         messages[message_count++] = copy;
     }
@@ -296,21 +300,21 @@ static double number(Text json, int item) {
 
 // Arrays.
 
-static double item_of(const unsigned char *bytes, char kind, int size, int is_big, FILE *out) {
+static void print_item(const unsigned char *bytes, char kind, int size, int is_big, FILE *out) {
     unsigned char little[8] = {0};
     for (int at = 0; at < size; at++) little[at] = bytes[is_big ? size - 1 - at : at];
     uint64_t whole;
     memcpy(&whole, little, 8);
-    if (kind == 'b') return fputs(whole ? "true" : "false", out), 0;
-    if (kind == 'u') return fprintf(out, "%llu", (unsigned long long)whole), 0;
-    if (kind == 'i') return fprintf(out, "%lld", (long long)(whole << (64 - 8 * size)) >> (64 - 8 * size)), 0;
     float narrow;
     double wide;
     memcpy(&narrow, little, sizeof narrow);
     memcpy(&wide, little, sizeof wide);
     if (size == 4) wide = narrow;
-    if (isfinite(wide)) return fprintf(out, "%.17g", wide), 0;
-    return fputs(isnan(wide) ? "NaN" : wide > 0 ? "Infinity" : "-Infinity", out), 0;
+    if (kind == 'b') fputs(whole ? "true" : "false", out);
+    else if (kind == 'u') fprintf(out, "%llu", (unsigned long long)whole);
+    else if (kind == 'i') fprintf(out, "%lld", (long long)(whole << (64 - 8 * size)) >> (64 - 8 * size));
+    else if (isfinite(wide)) fprintf(out, "%.17g", wide);
+    else fputs(isnan(wide) ? "NaN" : wide > 0 ? "Infinity" : "-Infinity", out);
 }
 
 static void print_array(Text blob, const char *where, FILE *out) {
@@ -332,7 +336,7 @@ static void print_array(Text blob, const char *where, FILE *out) {
     fputs("],\"data\":[", out);
     for (size_t at = start; at < blob.size; at += (size_t)(size - '0')) {
         if (at > start) fputc(',', out);
-        item_of((unsigned char *)blob.data + at, kind, size - '0', order == '>', out);
+        print_item((unsigned char *)blob.data + at, kind, size - '0', order == '>', out);
     }
     fputs("]}", out);
 }
@@ -464,17 +468,18 @@ static Encoded encoded(char **words, int count, const char *above) {
 
 // What a program does. A place such as `arm.joints.0` has names of letters, digits and the like, and indexes.
 
-typedef struct { const char *all; char *key, *steps[128], suffix[1024]; int count; } Place;
+typedef struct { const char *all; char *key, *steps[256], suffix[1024]; int count; } Place; // a text of 500 bytes has no more
 
 static Place place_of(const char *text) {
     Place it = {.all = text, .key = strdup(text), .suffix = ""};
     char *at = strchr(it.key, '.');
     if (!*text || text[strcspn(text, "[]{}\"'\\~%*?^ ")] || strlen(text) > 500) fail("'%s' is not like arm.joints.0", text);
-    while (at != NULL && it.count < 128) {
+    while (at != NULL) {
         *at++ = 0;
         it.steps[it.count] = at;
         if ((at = strchr(at, '.')) != NULL) *at = 0;
         char *step = it.steps[it.count++];
+        if (!*step) fail("'%s' is not like arm.joints.0", text);
         int is_index = *step && !step[strspn(step, "0123456789")];
         strcat(strcat(strcat(it.suffix, is_index ? "[" : "."), step), is_index ? "]" : "");
     }
@@ -638,6 +643,7 @@ static void watch(const Place *place, long most) {
         if (payload.data) {
             Text line = line_of(payload, 8, place, &data), kind = word(line, 5);
             lost = missing_before(line);
+            if (!is(kind, "set") && !is(kind, "look") && !is(kind, "delete")) fail("%s: a notice is of no kind", place->all);
             if (lost != 0 || is(kind, "look")) is_stale = 1;
             else {
                 const char *before = T("{\"kind\":\"%s\",\"lost\":0,\"path\":%s,\"value\":", kind.data, inside(line, "4").data).data;

@@ -288,7 +288,8 @@ async function publish(server, place, words) {
 function received(payload, fields, place) {
   const end = payload.indexOf("\n"), line = JSON.parse(payload.toString("utf8", 0, Math.max(end, 0)));
   check(Array.isArray(line) && line.length >= fields, `${place.text}: a message is not of REEM`);
-  check(fields === 9 || (typeof line[1] === "string" && line[2] > 0), `${place.text}: a notice has no publisher or number`);
+  const isNotice = typeof line[1] === "string" && line[2] > 0 && ["set", "look", "delete"].includes(line[5]);
+  check(fields === 9 || isNotice, `${place.text}: a notice has no publisher, number or kind`);
   check(line[0] === 1, `${place.text}: a message has version ${JSON.stringify(line[0])}; this client knows 1`);
   return [line, payload.subarray(end + 1)];
 }

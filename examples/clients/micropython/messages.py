@@ -17,8 +17,9 @@ def received(payload, fields, place):
     line = json.loads(head)
     check(isinstance(line, list) and len(line) >= fields, f"{place.text}: a message is not of REEM")
     check(line[0] == 1, f"{place.text}: a message has version {line[0]!r}; this client knows 1")
-    is_sound = fields == 9 or (isinstance(line[1], str) and isinstance(line[2], int) and line[2] > 0)
-    check(is_sound, f"{place.text}: a notice has no publisher or number")
+    is_notice = isinstance(line[1], str) and isinstance(line[2], int) and line[2] > 0
+    is_notice = is_notice and line[5] in ("set", "look", "delete")
+    check(fields == 9 or is_notice, f"{place.text}: a notice has no publisher, number or kind")
     return line, data
 
 

@@ -29,6 +29,7 @@ def placeholders(holder, where):
                     at[key] = math.ldexp(int(whole + fraction, 16), int(power) - 4 * len(fraction))
                 else:
                     check(label == "numpy", f"{where}: this client cannot read a value of the kind {label!r}")
+                    check("%" not in rest, f"{where}: this client reads arrays with plain names only")
                     found.append((at, key, rest.split(" ")[0]))
     check(len({name for _, _, name in found}) == len(found), f"{where}: two places have the same array")
     return found
