@@ -272,13 +272,8 @@ class LocalReader:
     ) -> memoryview | None:
         """Return the first `size` bytes of a slot, read-only; None if they are not to be had (any more).
 
-        The slot is not written while anything refers to the view, which may be a copy.
-
-        Args:
-            slot: Where it is.
-            size: Bytes.
-            passed: The descriptor that has arrived with the notice, if any.
-            is_near: Otherwise it can be found in `/proc`.
+        The slot is not written while anything refers to the view, which may be a copy. `passed` is the descriptor that
+        has arrived with the notice. Without it the publisher's is opened through `/proc`, if that `is_near`.
         """
         place = slot.process, slot.descriptor, slot.inode, slot.host
         try:
