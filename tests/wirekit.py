@@ -74,8 +74,8 @@ class Names:
 
     def fix(self, text):
         text = re.sub(r"\b1\d{9}\.\d+\b", "1795857094.178443", text)
-        text = re.sub(r",(9\.9\d*|10\.0),(?=\[)", ",9.998,", text)  # seconds that are left
-        text = re.sub(r'"PX" "1[45]\d{3}"', '"PX" "15000"', text)
+        text = re.sub(r",\d{1,2}\.\d+,(?=\[)", ",9.998,", text)  # seconds that are left
+        text = re.sub(r'"PX" "1\d{4}"', '"PX" "15000"', text)
         text = re.sub(r'(?<=["@: ])[0-9a-f]{12}(?:[0-9a-f]{4})?(?=[\\". \]]|$)', lambda found: self._id(found[0]), text)
         return re.sub(r"(\[\"[0-9a-f]{16}\"),\d+,\d+,\d+,(\d+),\d+,", r"\1,14448,22,174,\2,6990700168944915,", text)
 
@@ -176,7 +176,7 @@ def _writes(found, server, robot, names):
 def _leases(found, server, names):
     with server.interface(local="off") as interface:
         server.commands()
-        with reem.KeyValueStore(interface)["base"].own(ttl=0.3, name="joystick") as base:
+        with reem.KeyValueStore(interface)["base"].own(ttl=3, name="joystick") as base:
             base.write(1)
         owner = re.compile(r'(joystick\\",\\").*?\\",\d+,([\d.]+),\\".*?\\"')
         lines = [owner.sub(r'\1robot\\",14448,\2,\\"5mGZ0hqS6sQ\\"', each) for each in server.commands()]
