@@ -1,5 +1,6 @@
 """Recordings of other programs: ROS 2, protobuf and JSON in MCAP files that REEM did not write."""
 
+import base64
 import io
 import json
 import struct
@@ -164,6 +165,11 @@ def test_protobuf_and_json(tmp_path):
         with_schema = other.register_channel("/j", "json", other.register_schema("x", "jsonschema", b"{}"))
         for number in range(3):
             other.add_message(with_schema, BEGIN + number, json.dumps({"a": [number, None], "b": "x"}).encode(), BEGIN)
+        image = {"format": "jpeg", "data": base64.b64encode(jpeg(frame)).decode()}
+        picture_schema = other.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+        pictures = other.register_channel("/j/jpeg", "json", picture_schema)
+        other.add_message(pictures, BEGIN, json.dumps(image).encode(), BEGIN)
+        other.add_message(pictures, BEGIN + 1, json.dumps(image | {"data": "no picture"}).encode(), BEGIN)
         channel = other.register_channel("j", "json", 0)
         other.add_message(channel, BEGIN, b"[1, 2]", BEGIN)
         for encoding in ("ros1", "cbor"):
@@ -181,6 +187,8 @@ def test_protobuf_and_json(tmp_path):
         assert log["jpeg.data"].at(log.end).shape == frame.shape
         assert log["/j.a"].history()[1] == [[0, None], [1, None], [2, None]]
         assert log["j"].at(log.end) == [1, 2]
+        first, second = [update.value["data"] for update in log.updates(patterns=["j/jpeg"])]
+        assert (first.shape, second) == (frame.shape, "no picture")
         reasons = {each.topic: each.skipped for each in log.channels() if each.skipped}
         assert reasons.keys() == {"/ros1", "/cbor", "/idl", "/a{b}"}
         assert "'ros2idl'" in reasons["/idl"]
@@ -432,6 +440,9 @@ def test_several_files_as_one(ros, tmp_path):
         open_log([one, one])
     with pytest.raises(BadData, match="not an MCAP file"):
         open_log([one, __file__])
+    (pointer := tmp_path / "pointer.mcap").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(BadData, match="Git LFS"):
+        open_log(pointer)
     for nothing in ([], 7, b"x"):
         with pytest.raises(BadType):
             open_log(nothing)

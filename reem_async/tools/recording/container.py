@@ -51,6 +51,7 @@ _CACHED_ENTRIES = 4 << 20
 """Messages of which the places are kept, 16 bytes for each."""
 _SMALLEST_CHUNK, _LARGEST_CHUNK = 40, 1 << 31
 """Bytes. REEM closes a chunk with the message that takes it over a megabyte."""
+_LFS = b"version https://git-lfs"
 _BARE_BYTES = 1 << 20
 """Bytes of messages outside of chunks that are read as one chunk."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
@@ -254,9 +255,9 @@ class Container:
         self._source = Source(path)
         try:
             if self._source.peek(0, len(MAGIC)) != MAGIC:
-                raise DamagedRecording(
-                    f"{path} is not an MCAP file; give one that `reem record`, or another program, wrote"
-                )
+                is_pointer = self._source.peek(0, len(_LFS)) == _LFS
+                what = "fetch it: it is a pointer of Git LFS" if is_pointer else "give one that a recorder has written"
+                raise DamagedRecording(f"{path} is not an MCAP file; {what}")
             self.size = self._source.size
             self._contents = self._read_contents(progress)
         except BaseException:
