@@ -18,11 +18,9 @@ import importlib
 import logging
 import math
 import operator
-import queue
 import re
 import sys
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -347,7 +345,8 @@ class Bridge:
         self.direct = reem.PublishSpace(interface)
         self._lacking = True  # the dicts that hold the values may have to be made
         self._topics = file["topics"]
-        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._due: dict[Pair, bool] = {}  # parameters that may have changed, and whether one side has begun
+        self._due_changed = threading.Condition()
         # First all types, so that nothing is passed on by half of a file.
         kinds = [message_class(each["type"], partial(each.wrong, key="type")) for each in self._topics]
         self._parameters = [Pair(self, each) for each in file["parameters"]]
@@ -359,7 +358,8 @@ class Bridge:
 
     def close(self) -> None:
         self._closed.set()
-        self._jobs.put(lambda: None)
+        with self._due_changed:
+            self._due_changed.notify()
 
     def at(self, path: tuple[str, ...], store: Any = None) -> Any:
         place = self._kvs if store is None else store
@@ -441,30 +441,41 @@ class Bridge:
         def on_event(event: Any) -> None:
             for each in (*event.new_parameters, *event.changed_parameters):
                 if (pair := pairs.get((event.node, each.name))) is not None:
-                    self._jobs.put(pair.begin if each in event.new_parameters else pair.agree)
+                    has_begun = each in event.new_parameters
+                    pair.reported = None if has_begun else plain(parameter_value_to_python(each.value))
+                    self._is_due(pair, has_begun)
 
         for pair in self._parameters:
             pair.declare()
         self.node.create_subscription(ParameterEvent, "/parameter_events", on_event, qos_profile_parameter_events)
         self.thread(self._work)
         for pair in self._parameters:
-            self._jobs.put(pair.begin)
+            self._is_due(pair, True)
             self.thread(self._follow, pair)
 
     def _follow(self, pair: Pair) -> None:
         for _ in self.at(pair.entry["path"]).watch():
-            self._jobs.put(pair.agree)
+            self._is_due(pair, False)
+
+    def _is_due(self, pair: Pair, has_begun: bool) -> None:
+        with self._due_changed:
+            self._due[pair] = has_begun or self._due.get(pair, False)
+            self._due_changed.notify()
 
     def _work(self) -> None:
-        while not self._closed.is_set():
-            job = self._jobs.get()
-            while not self._closed.is_set():
-                try:
-                    job()
-                    break
-                except (reem.ReemError, RedisError) as error:
-                    logger.warning("trying again: %s", error)
-                    time.sleep(1)
+        while True:
+            with self._due_changed:
+                self._due_changed.wait_for(lambda: self._due or self._closed.is_set())
+                if self._closed.is_set():
+                    return
+                pair, has_begun = next(iter(self._due.items()))
+                del self._due[pair]
+            try:
+                pair.agree(has_begun)
+            except (reem.ReemError, RedisError) as error:
+                self.report(pair.entry, f"trying again: {error}")
+                self._is_due(pair, has_begun)
+                self._closed.wait(1)
 
 
 class Pair:
@@ -473,6 +484,7 @@ class Pair:
     def __init__(self, bridge: Bridge, entry: Entry) -> None:
         self.entry = entry
         self._bridge = bridge
+        self.reported: Any = None  # the last change of the parameter of which ROS has notified the bridge
         self._agreed: Any = None  # the value that both had last
         self._client: Any = None  # of the node that has the parameter; None for the bridge's own
 
@@ -490,13 +502,10 @@ class Pair:
         except (TypeError, ValueError) as error:
             raise self.entry.wrong(f"{value!r:.60} cannot be a parameter of ROS ({error})", "default") from None
 
-    def begin(self) -> None:
-        """Make both equal when the bridge or the node has begun: what is stored wins."""
-        self._agreed = None
-        self.agree()
-
-    def agree(self) -> None:
-        """Make both equal. An event only says that something has changed: what counts is what is there now."""
+    def agree(self, has_begun: bool) -> None:
+        """Make both equal, as they are now, whatever has changed."""
+        if has_begun:  # the bridge or the node: what is stored wins
+            self._agreed = None
         in_ros = self._in_ros()
         if in_ros is None:
             return
@@ -510,6 +519,8 @@ class Pair:
             if not refused:  # no answer
                 return
             self._bridge.report(self.entry, f"{self.entry['name']} = {value!r:.60} was refused by ROS: {refused}")
+        elif value is not None and in_ros not in (value, self.reported):
+            return  # of a node that has begun again, whose event is still to come
         if value != in_ros:
             *above, name = self.entry["path"]
             self._bridge.make_parents()

@@ -221,15 +221,18 @@ def running(bridge, graph, server_url, tmp_path, key):
     """A function that runs the bridge with a file, and returns the store that it writes to."""
     stores = []
 
-    def run(text):
+    def run(text, **before):
         namespace = f"{key()}:"
         (tmp_path / "b.yaml").write_text(f"{text}namespace: '{namespace}'\nserver: {server_url}\n")
         codes = []
         thread = threading.Thread(target=lambda: codes.append(bridge.main([str(tmp_path / "b.yaml")])))
         interface = reem.RedisInterface(server_url, namespace=namespace)
         stores.append((thread, interface, codes))
+        kvs = reem.KeyValueStore(interface)
+        for name, value in before.items():
+            kvs[name] = value
         thread.start()
-        return reem.KeyValueStore(interface)
+        return kvs
 
     yield run
     graph.is_down.set()
@@ -256,8 +259,7 @@ topics:
 
 
 def test_topics_go_both_ways(running, graph, caplog, server_url, bridge):
-    kvs = running(TOPICS)
-    kvs["state"] = "ready"
+    kvs = running(TOPICS, state="ready", cmd={"linear": {"x": 99}})
     node = rosstub.Node(graph, "robot")
     joints = rosstub.MESSAGES["sensor_msgs/JointState"](name=["a", "b"], position=rosstub.array.array("d", [1, 2]))
     eventually(lambda: "/camera" in getattr(graph.nodes.get("/reem_bridge"), "qos", {}))
@@ -286,7 +288,7 @@ def test_topics_go_both_ways(running, graph, caplog, server_url, bridge):
     eventually(lambda: "/cmd" in made.qos)
     kvs["cmd"] = {"linear": {"x": 1}}
     eventually(lambda: graph.published.get("/cmd", [None])[-1])
-    assert graph.published["/cmd"][-1].linear.x == 1.0
+    assert [each.linear.x for each in graph.published["/cmd"]] == [1.0]  # not the command of before
     for wrong in ({"linear": {"x": "fast"}}, {"linear": {"x": "fast"}}, {"lin": 1}):
         kvs["cmd"] = wrong
     eventually(lambda: "b.yaml:5: not passed on to /cmd: cmd: Twist has no field 'lin'" in caplog.text)
@@ -338,9 +340,11 @@ def test_parameters_go_both_ways(running, graph, caplog):
     eventually(lambda: values()["kp"] == kvs["control"]["kp"].read())
     kvs["control"]["kp"] = 9.0
     agree({"kp": 9.0, "speed": 0.5, "mode": "track"})
-    # The node goes and begins again: what is stored wins.
-    controller.destroy_node()
-    kvs["control"]["kp"] = 10.0
-    controller = rosstub.Node(graph, "controller")
-    controller.declare_parameter("gains.kp", 2.0)
-    agree({"kp": 10.0, "speed": 0.5, "mode": "track"})
+    # The node goes and begins again: what is stored wins, whether it was changed meanwhile or not.
+    for kp in (10.0, None):
+        controller.destroy_node()
+        if kp:
+            kvs["control"]["kp"] = kp
+        controller = rosstub.Node(graph, "controller")
+        controller.declare_parameter("gains.kp", 2.0)
+        agree({"kp": 10.0, "speed": 0.5, "mode": "track"})

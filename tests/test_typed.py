@@ -333,6 +333,11 @@ class PointBox(Box[Point]):
     label: str = ""
 
 
+@dataclasses.dataclass
+class TextBox(PointBox):
+    item: str = ""
+
+
 class BoxStruct(msgspec.Struct, typing.Generic[T]):
     item: T
 
@@ -423,6 +428,7 @@ def counted_rectangle():
     [
         (Box[Point], Box(Point(1)), {"item": {"x": 1.0, "y": 0.0}}),
         (PointBox, PointBox(Point(1)), {"item": {"x": 1.0, "y": 0.0}, "label": ""}),
+        (TextBox, TextBox("a"), {"item": "a", "label": ""}),
         (list[BoxStruct[Mode]], [BoxStruct(Mode.IDLE)], [{"item": "idle"}]),
         (BoxModel[Mode], BoxModel[Mode](item=Mode.IDLE), {"item": "idle"}),
         (Node, Node(1, Node(2)), {"value": 1, "next": {"value": 2, "next": None}}),
