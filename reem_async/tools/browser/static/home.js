@@ -44,6 +44,7 @@ export class Home {
   }
 
   async update(signal) {
+    this.app.layouts.show();
     const { app } = this, { pins } = app.layout, pinned = await this.pinned(pins, signal);
     const busiest = app.layout.value.busiest === false ? [] : (await this.busiest(signal)).slice(0, Math.max(MOST - pinned.length, 0));
     if (signal?.aborted) return;

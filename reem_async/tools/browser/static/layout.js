@@ -82,12 +82,16 @@ export class LayoutBar {
   }
 
   async update(signal) {
-    const { layout } = this.app, now = performance.now();
+    const now = performance.now();
     if (now > (this.next ?? 0)) {
       this.next = now + PAUSE;
       this.saved = new Map(Object.entries((await getJson("layouts", {}, signal)).layouts));
     }
-    const names = [["own", "own"], ...[...this.saved.keys()].map((name) => [`saved ${name}`, name])];
+    this.show();
+  }
+
+  show() {
+    const { layout } = this.app, names = [["own", "own"], ...[...this.saved.keys()].map((name) => [`saved ${name}`, name])];
     if (layout.name === "") names.push(["link", "from the link"]);
     else if (layout.name !== null && !this.saved.has(layout.name)) names.push([`saved ${layout.name}`, layout.name]);
     const chosen = layout.name === null ? "own" : layout.name === "" ? "link" : `saved ${layout.name}`, options = names.map(([value, text]) => [value, text + (value === chosen && layout.changed ? " (changed)" : "")]);

@@ -56,7 +56,7 @@ export class TimeBar {
     this.live.setAttribute("aria-pressed", String(!past));
     this.live.disabled = !past && !app.config.live;
     const since = app.sinceText();
-    setText(document.getElementById("marked"), since && `changed ${since}`);
+    setText(document.getElementById("marked"), since.startsWith("since") ? since : since && `changed ${since}`);
     this.clock.textContent = this.texts().join("\n");
     this.slider.setAttribute("aria-valuetext", this.texts().join(", "));
   }
