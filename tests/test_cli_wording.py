@@ -25,6 +25,7 @@ OF_PROGRAMS = {
     "pubsub/callbacks.py": ["such as ttl=0.2"],  # no command has a callback
     "pubsub/mirror.py": ["use one of the two"],  # no command has a mirror
     "ships/registry.py": ["read it in a program that has this ship"],
+    "coordination/parameter_objects.py": ["each field has its own"],  # no command declares a parameter
     "plan/leases.py": ["own(take=True)"],  # no command owns a key
     "store/send_queue.py": ["on_error= is for wait=False"],  # commands wait
     "plan/documents.py": ["value.to_dict(as_series=False)"],  # of a data frame, which no command can hold
