@@ -142,12 +142,21 @@ def test_numbers_over_time_are_read_once_and_parts_of_them_as_they_are(mixed, mo
         vectors = ask.json("series", path="arm.q")
         assert (vectors["names"][6], vectors["lines"][6][-1]) == ("[6]", 199.5)
         counts = ask.json("activity", bins=10, path="arm")["counts"]
+        content = Container.content
         monkeypatch.setattr(Container, "content", None)
         assert ask.json("series", path="arm.n", start=start + 10.1, end=start + 11.1) == part
         assert ask.json("activity", bins=10, path="arm")["counts"] == counts
         assert sum(counts) == 400
         assert ask.json("series", path="arm.n", start=end + 5, end=end + 6)["lines"] == [[399]]
         assert source._series[("arm", "q")].bytes == 400 * 8 * 8
+        monkeypatch.setattr(Container, "content", content)
+        monkeypatch.setattr(logsource, "_SERIES_BYTES", 5000)
+        monkeypatch.setattr(logsource, "_THINNED", 50)
+        some = ask.json("series", path="arm.a")
+        assert (some["lines"][0][0], some["lines"][2][-1]) == (0, 399)
+        assert source._series.keys() == {("arm", "a")}
+        assert source._series[("arm", "a")].bytes < 5000
+        assert ask.json("series", path="arm.a", start=start + 10.1, end=start + 11.1)["lines"] == part["lines"] * 3
 
 
 def test_the_page_is_there_before_a_long_file_is_open(mixed, tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import walk
 from ..jsontext import json_text
-from .source import LAYOUTS, Node, NotKept, Series, Source, address, path_of, silences, thinned, visible
+from .source import LAYOUTS, MOST_POINTS, Node, NotKept, Series, Source, address, path_of, silences, thinned, visible
 from .trees import CONTENTS
 
 # Requests: parameters are checked, and errors become answers with the right status.
@@ -156,7 +156,6 @@ _MOST_BRANCHES = 100
 _MOST_ROWS = 1000
 _MOST_ROWS_IN_ALL = 3000
 _MOST_MARKS = 5000
-_MOST_POINTS = 1200
 _MOST_LOSSES = 500
 _MOST_FOUND = 60
 _LONGEST_TEXT = 200_000
@@ -247,7 +246,9 @@ class Api:
         end, path = status.end if end is None else min(end, status.end), value_path_in(request)
         found = await self._source.series(path, start, end)
         losses = await self._source.losses(path, start, end) if found.times else []
-        marks = {"losses": [tuple(loss) for loss in losses[-_MOST_LOSSES:]], "quiet": silences(found.times, end)}
+        marks = {"losses": [tuple(loss) for loss in losses[-_MOST_LOSSES:]], "quiet": found.quiet}
+        if found.quiet is None:
+            marks["quiet"] = silences(found.times, end)
         return reply({"start": start, "end": end, **_thinned(found)._asdict(), **marks})
 
     async def activity(self, request: Request) -> Response:
@@ -379,9 +380,9 @@ def _marked(node: Node, marks: tuple[set[Path], set[Path]]) -> dict[str, Any]:
 
 
 def _thinned(series: Series) -> Series:
-    if len(series.times) <= _MOST_POINTS:
+    if len(series.times) <= MOST_POINTS:
         return series
-    places = thinned(np.array(series.lines, float).T, _MOST_POINTS)  # None becomes NaN
+    places = thinned(np.array(series.lines, float).T, MOST_POINTS)  # None becomes NaN
     lines = [[values[index] for index in places] for values in series.lines]
     return Series(series.names, [series.times[index] for index in places], lines)
 

@@ -25,6 +25,7 @@ from ..recording.align import stacked
 from ..recording.log import ArrayHandle, Log, open_log
 from .source import (
     MOST_LINES,
+    MOST_POINTS,
     Loss,
     Node,
     Page,
@@ -38,6 +39,8 @@ from .source import (
     node_of,
     numbers_in,
     rate_span,
+    silences,
+    thinned,
 )
 from .trees import differing, strip
 
@@ -49,6 +52,7 @@ _CACHED = 8  # states that are kept: neighbouring instants are asked for togethe
 _COUNTED = 64  # paths of which the numbers of updates over time are kept
 _PART = 0.2  # of a recording; the numbers of less than that are read each time, those of more are kept
 _SERIES_BYTES = 64 << 20  # of the numbers over time that are kept, for a page that zooms
+_THINNED = 100_000  # rows that are kept of more than that
 _ROUNDING = 1e-6
 """Seconds: instants here are floats, those in the file nanoseconds; what happens at an instant belongs to it."""
 _AT_ONCE = 1.0  # seconds that opening may take before the page begins without it
@@ -233,13 +237,14 @@ class LogSource(Source):
         return await self._read(lambda step: self._numbers(path, start, end, step).between(start, end))
 
     def _numbers(self, path: Path, start: float, end: float, step: Step) -> _Columns:
-        if path in self._series:
+        kept, is_part = self._series.get(path), end - start < _PART * self.log.duration
+        if kept is not None and (kept.is_whole or not is_part):
             self._series.move_to_end(path)
-            return self._series[path]
+            return kept
         at_end = get(self._state(self._when(None)), path)
         if isinstance(at_end, Unfetched | np.ndarray) and not is_small_vector(at_end):
             return _NONE  # large arrays are not read for this
-        if end - start < _PART * self.log.duration:
+        if is_part:
             return _columns(self._outlines(path, self.log.last_news(path, start) or start, end, step))
         found = self._series[path] = _columns(self._outlines(path, None, None, step))
         while sum([it.bytes for it in self._series.values()]) > _SERIES_BYTES and len(self._series) > 1:
@@ -278,26 +283,28 @@ class LogSource(Source):
 
 
 class _Columns(NamedTuple):
-    """The numbers of a path over all of the recording: an instant for each row, and a column for each line."""
+    """The numbers of a path over time: an instant for each row, and a column for each line."""
 
     names: list[str]
     times: np.ndarray[Any, Any]
     rows: np.ndarray[Any, Any]  # NaN where there was no number
+    is_whole: bool = True  # else there were so many that only some rows are kept, the extremes among them
 
     @property
     def bytes(self) -> int:
         return int(self.times.nbytes + self.rows.nbytes)
 
     def between(self, start: float, end: float) -> Series:
-        """Return the part from what was there at the start on."""
+        """Return the part from what was there at the start on, as much of it as is drawn."""
         first, last = np.searchsorted(self.times, [start, end + _ROUNDING])
         times, rows = self.times[first:last], self.rows[first:last]
         if first and (first == len(self.times) or self.times[first] > start):
             times, rows = np.append(start, times), self.rows[first - 1 : last]
-        lines = rows.T.tolist()
-        if np.isnan(rows).any():
-            lines = [[None if number != number else number for number in line] for line in lines]
-        return Series(self.names, times.tolist(), lines) if times.size else Series([], [], [])
+        if not times.size:
+            return Series([], [], [])
+        places = thinned(rows, MOST_POINTS)
+        lines = [[None if number != number else number for number in line] for line in rows[places].T.tolist()]
+        return Series(self.names, times[places].tolist(), lines, silences(times, end))
 
 
 _NONE = _Columns([], np.empty(0), np.empty((0, 0)))
@@ -305,7 +312,8 @@ _NONE = _Columns([], np.empty(0), np.empty((0, 0)))
 
 def _columns(parts: Iterable[tuple[np.ndarray[Any, Any], list[Any]]]) -> _Columns:
     """Return what `numbers_in` makes of values that come in parts, mostly as arrays from the beginning."""
-    times, blocks, is_list = [], [], False
+    blocks: list[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = []
+    is_list, is_whole, size = False, True, 0
     for instants, values in parts:
         array, has_items = stacked(values), isinstance(values[0], np.ndarray | list)
         if isinstance(array, np.ndarray) and array.ndim == 1 + has_items and array[:1].size <= MOST_LINES:
@@ -316,13 +324,24 @@ def _columns(parts: Iterable[tuple[np.ndarray[Any, Any], list[Any]]]) -> _Column
             found = numbers_in(zip(instants.tolist(), values, strict=True))
             block = np.array(found.lines, np.float64).T if found.lines else np.full((len(values), 1), np.nan)
             is_list = is_list or found.names[:1] == ["[0]"]
-        times.append(instants)
-        blocks.append(block)
-    width = max([block.shape[1] for block in blocks], default=0)
-    rows = [np.pad(block, ((0, 0), (0, width - block.shape[1])), constant_values=np.nan) for block in blocks]
-    if not rows or np.isnan(whole := np.concatenate(rows)).all():
+        blocks.append((instants, block))
+        size += block.nbytes + instants.nbytes
+        if size > _SERIES_BYTES:
+            times, rows = _joined(blocks)
+            places = thinned(rows, _THINNED)
+            blocks, is_whole = [(times[places], rows[places])], False
+            size = sum([each.nbytes for each in blocks[0]])
+    times, rows = _joined(blocks)
+    if np.isnan(rows).all():
         return _NONE
-    return _Columns([f"[{index}]" for index in range(width)] if is_list else [""], np.concatenate(times), whole)
+    names = [f"[{index}]" for index in range(rows.shape[1])] if is_list else [""]
+    return _Columns(names, times, rows, is_whole)
+
+
+def _joined(blocks: list[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]]) -> tuple[Any, Any]:
+    width = max([rows.shape[1] for _, rows in blocks], default=0)
+    rows = [np.pad(each, ((0, 0), (0, width - each.shape[1])), constant_values=np.nan) for _, each in blocks]
+    return np.concatenate([np.empty(0), *[times for times, _ in blocks]]), np.concatenate([np.empty((0, width)), *rows])
 
 
 def _unfetched(it: Any) -> Any:

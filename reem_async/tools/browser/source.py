@@ -194,6 +194,7 @@ class Series(NamedTuple):
     names: list[str]  # what each line is: one empty text, or the indexes of a list
     times: list[float]  # seconds since 1970
     lines: list[list[float | None]]  # for each name as many numbers as there are times, None where there was no number
+    quiet: list[tuple[float, float]] | None = None  # see `silences`; None if times has all of them
 
 
 class Source(Protocol):
@@ -281,8 +282,9 @@ def rate_span(at: float, start: float, end: float) -> tuple[float, float] | None
     return None if until > end else (since, until)
 
 
-# Items of a list or vector up to which each is drawn as a line over time.
+# Items of a list or vector up to which each is drawn as a line over time, and points of a line.
 MOST_LINES = 16
+MOST_POINTS = 1200
 _LARGEST_VECTOR = 8 * MOST_LINES  # bytes
 
 
@@ -306,15 +308,15 @@ def numbers_in(samples: Iterable[tuple[float, Any]]) -> Series:
 _LONG_PAUSE, _SHORTEST_SILENCE, _FEWEST = 10, 0.5, 8
 
 
-def silences(times: Sequence[float], end: float) -> list[tuple[float, float]]:
+def silences(times: Sequence[float] | np.ndarray[Any, Any], end: float) -> list[tuple[float, float]]:
     """Return the spans in which nothing came of what usually comes more often, until `end`."""
     if len(times) <= _FEWEST:
         return []
-    pauses = np.diff([*times, max(end, times[-1])])
+    pauses = np.diff(np.append(times, max(end, times[-1])))
     # The first is the beginning of what is known, and no update.
     long = max(_LONG_PAUSE * float(np.median(pauses[1:-1])), _SHORTEST_SILENCE)
     places = np.flatnonzero(pauses > long).tolist()
-    return [(times[place], times[place] + float(pauses[place])) for place in places]
+    return [(float(times[place]), float(times[place] + pauses[place])) for place in places]
 
 
 def thinned(columns: np.ndarray[Any, Any], most: int) -> list[int]:

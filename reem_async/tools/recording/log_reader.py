@@ -43,6 +43,10 @@ class _FoundDamage(Exception):
     """A part of the file turned out to be damaged and was left out: what needs it is to be found again."""
 
 
+_UNKNOWN = object()
+"""In the place of what was at a path before."""
+_TOGETHER = 64
+"""Changes that `batches` yields at once where each is made of the one before."""
 _DAMAGED = object()
 """In the place of a value that cannot be read."""
 
@@ -274,16 +278,18 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 yield ref, stream, value
 
     def following(
-        self, path: Path, after: int, until: int, last: Any = MISSING
+        self, path: Path, after: int, until: int, last: Any = _UNKNOWN
     ) -> Iterator[tuple[list[Ref], bool, Any]]:
         """Yield the news on a full path of each instant, whether it only repeats, and what was there after it.
 
-        `last` is what was there before, if that is known. If a part of the file is damaged, keyframes are news too.
+        `last` is what was there at first, if that is known. If a part of the file is damaged, keyframes are news too.
         """
         anchor, streams = self._anchor(path), self._streams_of(path)
         roles = (*NEWS, Role.KEYFRAME)
         chosen = [it for it in streams if it.role in roles and related(it.path, anchor)]
-        tree = self.tree(anchor, after) if chosen and after >= 0 else MISSING
+        tree = last
+        if last is _UNKNOWN:
+            tree, last = self.tree(anchor, after) if chosen and after >= 0 else MISSING, MISSING
         for refs in self._instants([each for it in chosen for each in it.channels], after, until):
             is_read, is_whole = False, True
             for ref in refs:
@@ -315,10 +321,19 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def batches(self, path: Path, after: int, until: int) -> Iterator[tuple[list[int], list[Any], bool]]:
         """Yield what `values` does, many at a time."""
         stopped = yield from self._written_whole(path, after, until)
-        if stopped is not None:
-            for refs, repeats, tree in self.following(path, stopped[0], until, stopped[1]):
-                if not repeats:
-                    yield [refs[0].time], [tree], False
+        if stopped is None:
+            return
+        times: list[int] = []
+        trees: list[Any] = []
+        for refs, repeats, tree in self.following(path, stopped[0], until, stopped[1]):
+            if not repeats:
+                times.append(refs[0].time)
+                trees.append(tree)
+            if len(times) >= _TOGETHER:
+                yield times, trees, False
+                times, trees = [], []
+        if times:
+            yield times, trees, False
 
     def _written_whole(
         self, path: Path, after: int, until: int
@@ -333,7 +348,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         at, last = after, MISSING
         is_whole = self._anchor(path) == path and all(len(it.path) <= len(path) for it in streams)
         if not is_whole or any(channel in self.foreign.keys for it in streams for channel in it.channels):
-            return at, last
+            return after, _UNKNOWN
         readers = {channel: self._reader(channel, path) for it in streams for channel in it.channels}
         for batch in self.timeline.batches(readers, after, until):
             content = None if batch is None else self._container.content(batch.chunk)
@@ -350,7 +365,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                     yield times, trees, True
                     continue
             rows = zip(batch.times.tolist(), batch.channels.tolist(), batch.offsets.tolist(), strict=True)
-            is_sound = True
+            is_sound, times, found = True, [], []
             for at, channel, offset in rows:
                 stream = self.of_channel[channel]
                 whole = self._readable(Ref(at, batch.chunk, offset, channel), stream)
@@ -363,7 +378,10 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 repeats = repeats and same(tree, last)
                 last = tree
                 if not repeats:
-                    yield [at], [tree], False
+                    times.append(at)
+                    found.append(tree)
+            if times:
+                yield times, found, False
             if not is_sound:  # keyframes are news from now on
                 return at, last
         return None
