@@ -229,7 +229,7 @@ def test_a_robot_in_c_is_seen_by_all_tools(server, lab_program, file):
     """JSON at 1 kHz, images at 30 Hz, a hash and a stream; the tools get no option."""
     port, path = server.url.rpartition(":")[2], "sai::sensors::Panda::joint_positions"
     cli = CommandLine(server.url, "")
-    with subprocess.Popen([lab_program, "127.0.0.1", port, "600"], stdout=subprocess.PIPE, text=True) as robot:
+    with subprocess.Popen([lab_program, "127.0.0.1", port, "300"], stdout=subprocess.PIPE, text=True) as robot:
         try:
             with served(live(server.url)) as (address, _), client_of(address) as page:
                 with cli.running("record", "-o", file, "--json") as recording:
