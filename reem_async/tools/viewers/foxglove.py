@@ -25,8 +25,8 @@ from .topics import Topics
 
 logger = logging.getLogger("reem.foxglove")
 
-_BACKLOG = 256
-"""Messages that wait for a slow client before the oldest is dropped."""
+_BACKLOG = 128
+"""Messages that wait for a slow client before the oldest is dropped: of pictures, hundreds of MB."""
 _WAITING = 1000  # updates of a key that wait here
 _PARAMETERS_EVERY = 1.0  # seconds
 _REPORT_EVERY = 5.0  # seconds between two reports of losses
