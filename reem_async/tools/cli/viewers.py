@@ -29,7 +29,10 @@ def foxglove(
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
     log: Annotated[
-        Path | None, typer.Option("--log", metavar="FILE", callback=existing, dir_okay=False, help="Play a recording.")
+        list[Path] | None,
+        typer.Option(
+            "--log", metavar="FILE", callback=existing, dir_okay=False, help="Play a recording; several are one."
+        ),
     ] = None,
     host: Annotated[str, typer.Option(metavar="ADDRESS", help="Where to listen; there is no password.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one.")] = 8765,
@@ -50,9 +53,9 @@ def foxglove(
     """
     with guarded("foxglove"):
         known = named_ships(ships)
-        if log is not None and allow_write:
+        if log and allow_write:
             raise CommandFailed("a recording is not changed: leave out --allow-write, or --log", USAGE)
-    if log is not None:
+    if log:
         run_local("foxglove", lambda: _play(log, keys or [], known, host, port, rate), live=True)
         return
 
@@ -69,13 +72,13 @@ def foxglove(
     run("foxglove", work, url, namespace, live=True, ships=known)
 
 
-def _play(log: Path, keys: list[str], ships: list[Any], host: str, port: int, rate: float) -> None:
+def _play(log: list[Path], keys: list[str], ships: list[Any], host: str, port: int, rate: float) -> None:
     from ..recording import open_log
     from ..viewers.player import FoxglovePlayer
 
     with open_log(log, ships) as opened:
         player = FoxglovePlayer(opened, keys, host=host, port=port, rate=rate)
-        _tell(player.bridge, log.name, host, "reading")
+        _tell(player.bridge, ", ".join(each.name for each in log), host, "reading")
         try:
             player.run()
         finally:
