@@ -307,4 +307,5 @@ def test_what_cannot_be_shown_is_refused(cli, tmp_path):
     assert "names a place in a key" in cli.error(2, "foxglove", "arm.q")
     if pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install rerun-sdk"):
         assert "--force" in cli.error(2, "rerun", "--save", str(there))
+        assert "no viewer of Rerun answers" in cli.error(1, "rerun", "--connect", "rerun+http://127.0.0.1:9/proxy")
         assert "no address of Rerun" in cli.error(2, "rerun", "--connect", "nowhere")

@@ -16,7 +16,7 @@ from .running import USAGE, CommandFailed, guarded, run, run_local
 
 Keys = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[KEY]...", show_default=False, help="Only these keys; * and ? stand for other characters."),
+    typer.Argument(metavar="KEY", show_default=False, help="Only these keys; * and ? stand for other characters."),
 ]
 Rate = Annotated[
     float,
@@ -107,7 +107,9 @@ def rerun(
     ] = None,
     spawn: Annotated[bool, typer.Option("--spawn", help="Start a viewer on this machine; the default.")] = False,
     save: Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Write an .rrd file.")] = None,
-    rate: Rate = 30,
+    rate: Annotated[
+        float, typer.Option(min=0.1, max=1000, metavar="HZ", help="How often a second each key is sent, at most.")
+    ] = 30,
     force: Force = False,
     ships: Ships = None,
 ) -> None:

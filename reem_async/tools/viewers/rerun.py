@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Sequence
 from pathlib import Path as FilePath
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -20,6 +22,8 @@ from ..recording.layout import is_picture, picture_format
 from .base import Viewer, extra, lower_priority
 
 _EXAMPLE = "rerun+http://127.0.0.1:9876/proxy"
+_PORT = 9876  # of an address without one
+_CONNECTED = 5.0  # seconds in which a viewer must answer
 _TIMELINE = "publish_time"
 _MOST_NUMBERS = 64  # of a list or vector that is drawn as curves
 _MOST_ENTITIES = 1000  # of a key: Rerun keeps each for good
@@ -43,7 +47,7 @@ class RerunViewer(Viewer):
         super().__init__(interface, patterns, Newest)
         lower_priority()  # before Rerun begins its threads, which inherit it
         self._rerun: Any = extra("rerun", "rerun-sdk")
-        self._recording = self._rerun.RecordingStream(f"reem {interface.hostname}")
+        self._recording = self._rerun.RecordingStream("reem")
         # The first entry takes a second, in which Rerun imports most of itself: not while updates wait.
         self._rerun.Scalars(0.0).as_component_batches()
         self._gap = 1 / rate
@@ -58,13 +62,20 @@ class RerunViewer(Viewer):
         Raises:
             BadValue: The address is none of Rerun's.
             FileExistsError: The file is there, without `force`.
-            ServerFailed: No viewer could be started.
+            ServerFailed: No viewer answers there, or none could be started.
         """
         if save is not None:
             if save.exists() and not force:
                 raise FileExistsError(f"{save} exists; use --force to replace it")
             self._recording.save(str(save))
         elif connect is not None:
+            # Rerun itself would wait for a viewer for ever, with all that is sent to it.
+            place = urlsplit(connect)
+            try:
+                if place.hostname:
+                    socket.create_connection((place.hostname, place.port or _PORT), _CONNECTED).close()
+            except OSError as error:
+                raise ServerFailed(f"no viewer of Rerun answers at {connect}: {error}; start it with: rerun") from None
             try:
                 self._recording.connect_grpc(connect)
             except (ValueError, RuntimeError) as error:
