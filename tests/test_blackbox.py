@@ -39,7 +39,7 @@ async def test_what_is_saved_equals_a_recording_made_beside_it(key, akvs, apspac
                 await akvs[old]["t"].write(0.7)  # only stored
                 await apspace[arm]["gone"].delete()
             await asyncio.sleep(0.02)
-        saving = asyncio.ensure_future(box.save(tmp_path / "crash.mcap", after=0.3))
+        saving = asyncio.ensure_future(box.save(tmp_path / "crash.mcap", after=1.0))
         for number in range(60, 70):
             await apspace[arm]["n"].write(number)
             await asyncio.sleep(0.02)

@@ -87,9 +87,12 @@ class RerunViewer(Viewer):
                 raise ServerFailed(f"no viewer of Rerun could be started: {error}") from None
 
     def close(self) -> None:
-        """Send what waits, and end."""
-        self._send_due(None)
-        self._recording.flush(timeout_sec=_FLUSH)
+        """Send what waits, and end; raises ServerFailed if the viewer has gone."""
+        try:
+            self._send_due(None)
+            self._recording.flush(timeout_sec=_FLUSH)
+        except RuntimeError as error:
+            raise ServerFailed(f"the viewer of Rerun has gone, and what waited for it is lost: {error}") from None
         self._recording.disconnect()
 
     def wants(self, name: str) -> bool | None:
