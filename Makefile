@@ -42,7 +42,8 @@ floors: .venv-floors/ready  ## the fast run's core on the lowest versions of dep
 .venv-floors/ready: pyproject.toml $(VENV)/ready
 	$(BIN)/uv venv -q --clear --python $(BIN)/python .venv-floors
 	$(BIN)/uv pip install -q --python .venv-floors --resolution lowest-direct -e '.[server,tools,parquet,fast]'
-	$(BIN)/uv pip install -q --python .venv-floors pytest pytest-asyncio pytest-xdist hypothesis httpx playwright trustme
+	$(BIN)/uv pip install -q --python .venv-floors pytest pytest-asyncio pytest-xdist hypothesis httpx playwright trustme \
+		mcap-protobuf-support mcap-ros2-support
 	touch $@
 
 dist: $(VENV)/ready  ## sdist and wheel in dist/, checked; then the README, followed with nothing but the wheel installed
