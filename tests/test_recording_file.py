@@ -250,6 +250,22 @@ def test_a_flipped_bit_is_counted_if_it_costs_something(names, file_and_values, 
     assert noticed > (20 if heads else 40)
 
 
+def test_a_record_that_covers_the_records_behind_it_is_counted(names, file_and_values, tmp_path):
+    file, seen = file_and_values
+    data, damaged = file.read_bytes()[:-150], tmp_path / "damaged.mcap"
+    places = starts(data)
+    for number in range(1, len(places) - 4, sized(5, 1)):
+        for further in (2, 3, 5):
+            if number + further < len(places):
+                place, end = places[number], places[number + further]
+                broken = bytearray(data)
+                broken[place + 1 : place + 9] = (end - place - 9).to_bytes(8, "little")
+                damaged.write_bytes(broken)
+                with contextlib.suppress(DamagedRecording):
+                    found, count, unreadable = check(damaged, names, seen)
+                    assert count or found + unreadable == len(seen), (place, further)
+
+
 def mutated(data, rng):
     broken = bytearray(data)
     for _ in range(rng.choice([1, 1, 5])):

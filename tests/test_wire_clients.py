@@ -122,7 +122,7 @@ def ends_with_an_error(done):
 
 def keys_of(url, name):
     with contextlib.closing(redis.Redis.from_url(url, decode_responses=True)) as raw:
-        return sorted(raw.keys(f"{{{name}}}*"))
+        return sorted(raw.scan_iter(f"{{{name}}}*", count=1000))
 
 
 class Watch:

@@ -209,7 +209,10 @@ class _Scan:
 
     def _take_chunk(self, position: int, end: int) -> int:
         """Take a chunk with the index behind it; return where that ends."""
-        start, last = struct.unpack("<QQ", self._source.peek(position + HEAD.size, 16))
+        start, last, _, _, name = _CHUNK_HEAD.unpack(self._source.peek(position + HEAD.size, _CHUNK_HEAD.size))
+        data = position + HEAD.size + _CHUNK_HEAD.size + name + 8
+        packed = int.from_bytes(self._source.peek(data - 8, 8), "little") if data <= end else 0
+        self.damaged += data + packed != end  # one that is longer than its content may hide what follows
         index = end
         while index + HEAD.size <= self._size:
             opcode, length = HEAD.unpack(self._source.peek(index, HEAD.size))
@@ -231,8 +234,9 @@ class _Scan:
 
     def _take_metadata(self, start: int, end: int) -> None:
         try:
-            record = Metadata.read(ReadDataStream(io.BytesIO(self._source.read(start, end - start))))
-            self.contents.metadata[start] = record
+            stream = ReadDataStream(io.BytesIO(self._source.read(start, end - start)))
+            self.contents.metadata[start] = Metadata.read(stream)
+            self.damaged += stream.count != end - start
         except MALFORMED:
             self.damaged += 1
 

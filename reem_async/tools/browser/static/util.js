@@ -222,10 +222,11 @@ export function store(name, value) {
 
 // Put a new picture in the place of an old one once it is decoded: nothing flickers.
 export async function swap(image, blob) {
-  const url = URL.createObjectURL(blob), before = image.src;
-  const next = new Image();
+  const url = URL.createObjectURL(blob), next = new Image();
   next.src = url;
   await next.decode().catch(() => {});
   image.src = url;
-  if (before.startsWith("blob:")) URL.revokeObjectURL(before);
+  await image.decode().catch(() => {});
+  next.src = "";
+  URL.revokeObjectURL(url);  // the picture stays, also where another one has come meanwhile
 }
