@@ -71,6 +71,14 @@ function indexAt(times, at) {
   return low - 1;
 }
 
+const dark = matchMedia("(prefers-color-scheme: dark)");
+
+// The list of listeners must not keep plots of views that are closed.
+function redrawWithTheme(plot) {
+  const kept = new WeakRef(plot), redraw = () => { if (kept.deref()) kept.deref().draw(); else dark.removeEventListener("change", redraw); };
+  dark.addEventListener("change", redraw);
+}
+
 export class Plot {
   // options: axis, the TimeAxis of all plots over time; onPick, called with the x that was clicked; small, it is in a
   // pane; bars, each value holds until the next x, filled; log, the axis is logarithmic at first; onLog, called when that changes; onRemove, called with a key to take out.
@@ -92,7 +100,7 @@ export class Plot {
     this.selection = null; // what is being dragged over, to zoom in on it
     [this.left, this.bottom] = [NARROW, BOTTOM]; // px, of which the axes take
     new ResizeObserver(() => this.draw()).observe(this.canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+    redrawWithTheme(this);
     this.gestures = new Gestures(this);
   }
 
