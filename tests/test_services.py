@@ -18,7 +18,6 @@ import pytest
 from chaos.proxy import Proxy
 from conftest import (
     PATIENCE,
-    RawCluster,
     aeventually,
     assert_same,
     commands_run,
@@ -311,9 +310,6 @@ async def test_on_one_host_calls_need_no_server_in_between(akvs, early, raw, key
     sent = sum(after.get(name, 0) - before.get(name, 0) for name in ("publish", "spublish", "set"))
     assert sent <= 6  # pings
     await service.close()
-    if isinstance(raw, RawCluster):  # its nodes take a moment to know that nobody subscribes any more
-        with contextlib.suppress(ServiceLost):
-            await place.call(number=5)
     with pytest.raises(NoService):
         await place.call(number=5)
 
