@@ -3,6 +3,7 @@
     python -m benchmarks.gigabytes write /tmp/run.mcap --gigabytes 3     a robot's rates, without waiting for them
     python -m benchmarks.gigabytes library /tmp/run.mcap                 first keys, one number's history, memory
     python -m benchmarks.gigabytes page /tmp/run.mcap --actions 50       the same in Chromium: slider and plots
+    python -m benchmarks.gigabytes hour /tmp/run.mcap --minutes 60       memory of program and browser, each minute
 
 `write` and `library` run on earlier commits too: put the commit's tree first on PYTHONPATH.
 """
@@ -10,6 +11,7 @@
 import argparse
 import contextlib
 import math
+import os
 import pathlib
 import random
 import resource
@@ -175,11 +177,12 @@ _GO = """there => {
 }"""
 
 
-def page(file: pathlib.Path, actions: int) -> None:
-    """Print what a page in Chromium takes: until there are keys, and for each of some actions of a visitor."""
+@contextlib.contextmanager
+def _shown(file: pathlib.Path) -> Iterator[tuple[_Actions, subprocess.Popen[str]]]:
+    """Open the page in Chromium, as a visitor does; yields it when it has its first keys."""
     from playwright.sync_api import sync_playwright
 
-    rng, began = random.Random(1), time.perf_counter()
+    began = time.perf_counter()
     with _served(file) as (address, program), sync_playwright() as driver:
         print(f"{'reem browse --log answers':48} {time.perf_counter() - began:8.3f} s")
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--headless", "--no-sandbox"])
@@ -189,35 +192,76 @@ def page(file: pathlib.Path, actions: int) -> None:
         shown.locator("#tree .row").first.wait_for()
         print(f"{'first keys':48} {time.perf_counter() - began:8.3f} s")
         done.do("first page, wholly", lambda: None)
+        yield done, program
+        browser.close()
+
+
+def _act(done: _Actions, number: int, rng: random.Random) -> None:
+    """Do what a visitor does: four moves of the slider, then another view."""
+    if number % 5 == 0:
+        there = f"/view/{PLOTTED[number // 10 % len(PLOTTED)]}" if number % 10 == 0 else "/"
+        done.do("another view", lambda: done.page.evaluate(_GO, there))
+    else:
+        done.do("slider", lambda: done.page.evaluate(_SEEK, rng.random()))
+
+
+def page(file: pathlib.Path, actions: int) -> None:
+    """Print what a page in Chromium takes: until there are keys, and for each of some actions of a visitor."""
+    rng = random.Random(1)
+    with _shown(file) as (done, program):
         for number in range(actions):
-            path = PLOTTED[number % len(PLOTTED)]
-            if number % 5 == 0:
-                there = f"/view/{path}" if number % 10 == 0 else "/"
-                done.do("another view", lambda there=there: shown.evaluate(_GO, there))
-            else:
-                done.do("slider", lambda: shown.evaluate(_SEEK, rng.random()))
+            _act(done, number, rng)
         for what, took in done.took.items():
             print(f"{what:48} {statistics.median(took):8.3f} s median of {len(took)}, {max(took):.3f} at most")
         every = [each for what, took in done.took.items() if what != "first page, wholly" for each in took]
         print(f"{'all actions':48} {statistics.median(every):8.3f} s median of {len(every)}, {max(every):.3f} at most")
-        used = shown.evaluate("() => performance.memory.usedJSHeapSize") / 1e6
+        used = done.page.evaluate("() => performance.memory.usedJSHeapSize") / 1e6
         print(f"{'memory: the program, the JavaScript of the page':48} {_memory(program.pid):8.0f} MB, {used:.0f} MB")
-        browser.close()
+
+
+def _children(process: int) -> Iterator[int]:
+    """Yield the processes that a process started, and theirs."""
+    for task in pathlib.Path(f"/proc/{process}/task").glob("*/children"):
+        for child in map(int, task.read_text().split()):
+            yield child
+            yield from _children(child)
+
+
+def hour(file: pathlib.Path, minutes: int) -> None:
+    """Print the memory of the program and of Chromium each minute, with an action each 2.5 s."""
+    rng, number = random.Random(2), 0
+    with _shown(file) as (done, program):
+        for minute in range(1, minutes + 1):
+            for _ in range(24):
+                _act(done, number, rng)
+                number += 1
+                done.page.wait_for_timeout(2500)
+            nodes = done.page.evaluate("() => document.querySelectorAll('*').length")
+            browser = sum(_memory(each) for each in _children(os.getpid()) if each != program.pid)
+            took = sorted(each for what in ("slider", "another view") for each in done.took[what][-24:])
+            print(
+                f"minute {minute}: {number} actions, the program {_memory(program.pid):.0f} MB, the browser "
+                f"{browser:.0f} MB, {nodes} elements, an action {statistics.median(took):.2f} s",
+                flush=True,
+            )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("write", "library", "page"))
+    parser.add_argument("what", choices=("write", "library", "page", "hour"))
     parser.add_argument("file", type=pathlib.Path)
     parser.add_argument("--gigabytes", type=float, default=3.0)
     parser.add_argument("--actions", type=int, default=50)
+    parser.add_argument("--minutes", type=int, default=60)
     given = parser.parse_args()
     if given.what == "write":
         write(given.file, given.gigabytes * 1e9)
     elif given.what == "library":
         library(given.file)
-    else:
+    elif given.what == "page":
         page(given.file, given.actions)
+    else:
+        hour(given.file, given.minutes)
 
 
 if __name__ == "__main__":
