@@ -6,10 +6,12 @@ import json
 import struct
 import tracemalloc
 
+import lz4.frame
 import mcap.reader
 import mcap.writer
 import numpy as np
 import pytest
+import zstandard
 from clikit import invoked
 from conftest import sized
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -289,6 +291,24 @@ def test_huge_counts_take_no_memory(text):
             with pytest.raises(ValueError, match="should follow"):
                 read(b"\0\1\0\0" + count.to_bytes(4, "little") + b"\1" * 100)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_small_chunk_that_unpacks_to_much_takes_no_memory(tmp_path, compression):
+    """Of a chunk that names 1000 bytes and holds a gigabyte, no more is unpacked than it names."""
+    content, path = bytes(sized(64, 1024) << 20), tmp_path / "bomb.mcap"
+    packed = {"zstd": zstandard.ZstdCompressor().compress, "lz4": lz4.frame.compress}[compression](content)
+    name = struct.pack("<I", len(compression)) + compression.encode()
+    body = struct.pack("<QQQI", 1, 1, 1000, 0) + name + struct.pack("<Q", len(packed)) + packed
+    header = struct.pack("<BQII", 1, 8, 0, 0)
+    path.write_bytes(b"\x89MCAP0\r\n" + header + struct.pack("<BQ", 6, len(body)) + body)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DamagedRecording, match="without a channel: what it holds is damaged"):
+            open_log(path)
+        assert tracemalloc.get_traced_memory()[1] < 10 << 20
     finally:
         tracemalloc.stop()
 

@@ -49,8 +49,8 @@ from .mcap_reader import (
 _CACHED_BYTES = 96 << 20
 _CACHED_ENTRIES = 4 << 20
 """Messages of which the places are kept, 16 bytes for each."""
-_SMALLEST_CHUNK, _LARGEST_CHUNK = 40, 1 << 31
-"""Bytes. REEM closes a chunk with the message that takes it over a megabyte."""
+_SMALLEST_CHUNK, _LARGEST_CHUNK = 40, 1 << 30
+"""Bytes. REEM closes a chunk with the message that takes it over a megabyte. A message has up to 512 MB."""
 _LFS = b"version https://git-lfs"
 _BARE_BYTES = 1 << 20
 """Bytes of messages outside of chunks that are read as one chunk."""
@@ -64,11 +64,20 @@ class _Own(threading.local):
 
 
 _OWN = _Own()  # a decompressor is for one thread at a time
-# By the names that files have for them.
+
+
+def _unpack_zstd(data: memoryview, size: int) -> bytes:
+    # A frame that names its size is unpacked to that size, whatever `max_output_size` is; -1: it names none.
+    if zstandard.frame_content_size(data) not in (-1, size):
+        return b""
+    return _OWN.zstd.decompress(data, max_output_size=size)
+
+
+# By the names that files have for them; with the size that the chunk names, so that a small one takes little memory.
 _UNPACK: dict[bytes, Callable[[memoryview, int], bytes]] = {
     b"": lambda data, _: bytes(data),
-    b"lz4": lambda data, _: bytes(lz4.frame.decompress(data)),
-    b"zstd": lambda data, size: _OWN.zstd.decompress(data, max_output_size=size),
+    b"lz4": lambda data, size: bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)),
+    b"zstd": _unpack_zstd,
 }
 # What other records of these kinds would hide: all that follows.
 _END_LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
@@ -125,7 +134,7 @@ def _take_records(content: bytes, contents: Contents) -> Index | None:
         while position < len(content):
             opcode, length = HEAD.unpack_from(content, position)
             start, end = position + HEAD.size, position + HEAD.size + length
-            if end > len(content):
+            if end > len(content) or opcode == 0:
                 return None
             if opcode == Opcode.MESSAGE:
                 _, _, channel_id, _, log_time, _ = MESSAGE.unpack_from(content, position)
@@ -403,7 +412,7 @@ class Container:
             return info.length
         # Behind the head and two times: the size of the content.
         (size,) = struct.unpack("<Q", self._source.read(info.offset + HEAD.size + 16, 8))
-        return int(size)
+        return int(min(size, _LARGEST_CHUNK))
 
     def verify(self, progress: Progress | None = None) -> int:
         """Read every chunk; return how many records of the file are damaged."""

@@ -70,7 +70,8 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             if not is_described and not any(places.values()):
                 others |= channels
                 if not channels:
-                    raise DamagedRecording(f"{file.path} is an MCAP file without a channel: it holds nothing")
+                    why = "what it holds is damaged" if file.damaged else "it holds nothing"
+                    raise DamagedRecording(f"{file.path} is an MCAP file without a channel: {why}")
                 file.damaged += any(info.end >= LATEST for info in file.every_chunk)  # a time of centuries ahead
                 continue
             file.damaged += _missing(file, is_described)
