@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 import time
+import tracemalloc
 from urllib.parse import quote
 
 import numpy as np
@@ -497,6 +498,16 @@ def test_panes_are_moved_by_dragging_and_the_edge_as_well(visit, kvs, key):
 def test_what_an_overlay_names_is_drawn(hint, value, shapes):
     (parsed,) = hints_of(hint)
     assert shapes_of(parsed, value) == shapes
+
+
+def test_an_overlay_of_an_image_takes_little_memory():
+    image = np.ones((1000, 1000, 3), np.uint8)
+    tracemalloc.start()
+    try:
+        assert len(shapes_of(hints_of("det")[0], {"points": image})) == 500
+        assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_an_overlay_that_is_none_is_refused():

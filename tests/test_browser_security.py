@@ -160,6 +160,9 @@ def test_what_a_page_writes_is_published(write, robot, kvs, interface):
     assert kvs[robot]["nested"].read() == before, "a write that changes a type was not confirmed"
     assert write(f"{robot}.nested[1]", {"a": [1, None, "x"]}, retype=True).status_code == 200
     assert kvs[robot]["nested"].read() == [{"a": 1}, {"a": [1, None, "x"]}]
+    assert write(f"{robot}.nested[0].a", 0.5, retype=True).status_code == 200
+    huge = b'{"path":"%s.nested[0].a","value":1%s}' % (robot.encode(), b"0" * 400)  # larger than any float
+    assert write("", None, content=huge).json() == {"retyped": [f"{robot}.nested[0].a: float becomes int"]}
     big = write("", None, content=b'{"path":"%s.big","value":9223372036854775807}' % robot.encode())
     assert big.status_code == 200
     assert kvs[robot]["big"].read() == 2**63 - 1

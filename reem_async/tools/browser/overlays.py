@@ -15,6 +15,8 @@ from .source import finite, path_of, visible
 MOST_HINTS = 8  # in one text
 _LONGEST = 500  # characters of a text
 _MOST_SHAPES = 500  # that one hint draws
+_MOST_ROWS = 10_000  # of an array that are looked at: those with NaN are no shape
+_NUMBERS = 5  # of one shape that are used
 _LABEL = 40  # characters
 _DEEPEST = 4  # lists in lists
 _KINDS = ("boxes", "points")
@@ -80,11 +82,11 @@ def _items(hint: OverlayHint, value: Any, depth: int = 0) -> Iterator[tuple[list
     """Yield the numbers of each shape, its label, and what its numbers are."""
     if depth > _DEEPEST:
         raise BadValue(f"{show(hint.path)} is nested too deep for boxes or points; name what is in it")
-    plain = value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "biuf" else value
+    plain = _rows(value) if isinstance(value, np.ndarray) and value.dtype.kind in "biuf" else value
     if isinstance(plain, Mapping):
         yield from _named(hint, plain, depth)
     elif isinstance(plain, list) and plain and all(isinstance(it, int | float) for it in plain):
-        yield plain, "", "xyxy"
+        yield plain[:_NUMBERS], "", "xyxy"
     elif isinstance(plain, list):
         for it in plain:
             yield from _items(hint, it, depth + 1)
@@ -92,8 +94,15 @@ def _items(hint: OverlayHint, value: Any, depth: int = 0) -> Iterator[tuple[list
         raise BadValue(f"{show(hint.path)} has no {_SHAPE}; it is of type {type(value).__name__}")
 
 
+def _rows(array: np.ndarray[Any, Any]) -> Any:
+    """Return the beginning of an array as lists: all of an image as lists would take seconds."""
+    if array.ndim < 2 or not array.size:
+        return array[:_NUMBERS].tolist() if array.ndim else array.item()
+    return array.reshape(-1, array.shape[-1])[:_MOST_ROWS, :_NUMBERS].tolist()
+
+
 def _named(hint: OverlayHint, value: Mapping[str, Any], depth: int) -> Iterator[tuple[list[Any], str, str]]:
-    label, score = _first(value, _LABELS), _first(value, _SCORES)
+    label, score = [_texts(_first(value, names)) for names in (_LABELS, _SCORES)]
     inner = None if hint.kind == "points" else _first(value, _BOXES)
     inner = _first(value, _POINTS) if inner is None else inner
     if inner is not None:
@@ -110,8 +119,11 @@ def _named(hint: OverlayHint, value: Mapping[str, Any], depth: int) -> Iterator[
 
 
 def _first(value: Mapping[str, Any], names: tuple[str, ...]) -> Any:
-    found = next((value[name] for name in names if name in value), None)
-    return found.tolist() if isinstance(found, np.ndarray) else found
+    return next((value[name] for name in names if name in value), None)
+
+
+def _texts(found: Any) -> Any:
+    return found[:_MOST_ROWS].tolist() if isinstance(found, np.ndarray) and found.ndim == 1 else found
 
 
 def _nth(value: Any, index: int) -> Any:

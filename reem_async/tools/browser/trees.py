@@ -156,11 +156,12 @@ def leaves_size(tree: Any) -> int | None:
 
 
 _MOST_NAMED = 5  # types that change, in one message
+_WHOLE = 1 << 63  # larger integers cannot be stored, and some are beyond any float
 
 
 def fitted(old: Any, new: Any, path: Path) -> tuple[Any, list[str]]:
     """Return a new value with floats where there were floats, and what has another type than the old one, in words."""
-    if type(old) is float and type(new) is int and float(new) == new:
+    if type(old) is float and type(new) is int and abs(new) <= _WHOLE and float(new) == new:
         return float(new), []
     if type(old) is not type(new):
         return new, [f"{show(path)}: {type(old).__name__} becomes {type(new).__name__}"]

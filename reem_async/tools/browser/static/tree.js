@@ -5,6 +5,7 @@ import { addressUrl, ageText, bytesText, el, getJson, icon, nameOf, setNumbers, 
 
 const PAGE = 100;
 const BRANCHES = 90; // the program answers for 100 at a time
+const FARTHEST = 1e12; // item of a list that is asked for
 const PLAIN = ["int", "float", "bool", "NoneType"];
 const RIGHT = "M5 2l6 6-6 6z";
 
@@ -31,6 +32,9 @@ export class Tree {
     const answer = await getJson("tree", { at: app.at, since: app.since(), open }, signal);
     app.spanFrom(answer);
     this.branches = new Map(answer.branches.map((branch) => [branch.address, branch]));
+    const over = answer.branches.filter((branch) => branch.start > 0 && branch.start >= branch.total); // it has become shorter
+    for (const { address } of over) this.open.set(address, 0);
+    if (over.length) app.refresh();
     this.elsewhere = this.leaveOut?.(this.branches.get(this.root)?.nodes ?? []) ?? new Set(); // what is shown in another way
     this.loaded = true;
     this.render();
@@ -167,7 +171,7 @@ export class Tree {
     above.forEach((step, index) => {
       if (index < above.length - 1 && !this.open.has(step.address) && this.open.size < BRANCHES) this.open.set(step.address, 0);
       const item = /^\[(\d+)\]$/.exec(above[index + 1]?.part ?? "");
-      if (item && this.open.has(step.address)) this.open.set(step.address, Math.floor(Number(item[1]) / PAGE) * PAGE);
+      if (item && this.open.has(step.address)) this.open.set(step.address, Math.floor(Math.min(Number(item[1]), FARTHEST) / PAGE) * PAGE);
     });
     this.save();
     this.wanted = address;
