@@ -37,13 +37,16 @@ class Bridge:
     """A server of Foxglove's protocol, and what its clients ask for. Their requests come on threads of the server.
 
     Attributes:
+        owner: What answers the requests.
         topics: What clients can subscribe to.
         address: Where it listens, such as "ws://127.0.0.1:8765".
         link: The address of Foxglove's page in the web browser, which connects to it.
     """
 
-    def __init__(self, title: str, host: str, port: int, topics: Topics, foxglove: Any, **options: Any) -> None:
-        self.topics = topics
+    def __init__(
+        self, owner: Any, title: str, host: str, port: int, topics: Topics, foxglove: Any, options: dict[str, Any]
+    ) -> None:
+        self.owner, self.topics = owner, topics
         try:
             self.server = foxglove.start_server(
                 name=title,
@@ -94,13 +97,13 @@ class FoxgloveViewer(Viewer):
         self._foxglove = foxglove
         self._topics = Topics(foxglove, rate, self.skipped)
         self._allow_write = allow_write
-        self._loop = asyncio.get_running_loop()
+        self.loop = asyncio.get_running_loop()  # of its coroutines, which threads of the server call
         self._parameters: dict[str, Any] = {}  # what subscribed clients know
         self._parameters_due = self._report_due = 0.0
         self._subscribed: set[str] = set()
         self._reported: Counter[str] = Counter()
         options = {"capabilities": [foxglove.Capability.Parameters], "supported_encodings": ["json"]}
-        self.bridge = LiveBridge(self, interface.hostname, host, port, self._topics, foxglove, options)
+        self.bridge = LiveBridge(self, f"REEM {interface.hostname}", host, port, self._topics, foxglove, options)
 
     def wants(self, name: str) -> bool | None:
         return self._topics.wants(name)
@@ -189,31 +192,25 @@ class FoxgloveViewer(Viewer):
 
 
 class LiveBridge(Bridge):
-    """A bridge with parameters."""
-
-    def __init__(
-        self, viewer: FoxgloveViewer, title: str, host: str, port: int, topics: Topics, foxglove: Any, options: Any
-    ) -> None:
-        self._viewer, self._loop = viewer, asyncio.get_running_loop()
-        super().__init__(f"REEM {title}", host, port, topics, foxglove, **options)
+    """A bridge with parameters. Its owner is a `FoxgloveViewer`."""
 
     def _awaited(self, work: Any) -> Any:
         try:
-            return asyncio.run_coroutine_threadsafe(work, self._loop).result(_ANSWER)
+            return asyncio.run_coroutine_threadsafe(work, self.owner.loop).result(_ANSWER)
         except (ReemError, RedisError, OSError, TimeoutError) as error:
             logger.warning("a request for parameters failed: %s", error)
             return []
 
     def on_get_parameters(self, client: Any, names: list[str], request: str | None = None) -> list[Any]:
-        found: list[Any] = self._awaited(self._viewer.parameters(names))
+        found: list[Any] = self._awaited(self.owner.parameters(names))
         return found
 
     def on_set_parameters(self, client: Any, parameters: list[Any], request: str | None = None) -> list[Any]:
-        found: list[Any] = self._awaited(self._viewer.set_parameters(parameters))
+        found: list[Any] = self._awaited(self.owner.set_parameters(parameters))
         return found
 
     def on_parameters_subscribe(self, names: list[str]) -> None:
-        self._loop.call_soon_threadsafe(lambda: self._viewer.subscribe_parameters(names, begin=True))
+        self.owner.loop.call_soon_threadsafe(lambda: self.owner.subscribe_parameters(names, begin=True))
 
     def on_parameters_unsubscribe(self, names: list[str]) -> None:
-        self._loop.call_soon_threadsafe(lambda: self._viewer.subscribe_parameters(names, begin=False))
+        self.owner.loop.call_soon_threadsafe(lambda: self.owner.subscribe_parameters(names, begin=False))

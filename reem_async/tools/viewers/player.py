@@ -20,6 +20,7 @@ from .foxglove import Bridge
 from .topics import Topics
 
 _FASTEST = 100.0  # times the recorded pace
+_LONGEST_TURN = 0.1  # seconds of sending until the requests of clients are looked at again
 
 
 class FoxglovePlayer:
@@ -110,6 +111,9 @@ class FoxglovePlayer:
         self._then = now
         while self._next is not None and self._next[0] <= self._position:
             instant, name, tree = self._next
+            if time.monotonic() > now + _LONGEST_TURN:  # this machine cannot play so fast: the position waits
+                self._position = instant
+                break
             if tree is not MISSING:
                 self._topics.show(name, tree, nanoseconds(instant))
             self._next = next(self._coming, None)
@@ -161,13 +165,7 @@ class FoxglovePlayer:
 
 
 class PlayerBridge(Bridge):
-    """A bridge with playback controls."""
-
-    def __init__(
-        self, player: FoxglovePlayer, title: str, host: str, port: int, topics: Topics, foxglove: Any, options: Any
-    ) -> None:
-        self._player = player
-        super().__init__(title, host, port, topics, foxglove, **options)
+    """A bridge with playback controls. Its owner is a player."""
 
     def on_playback_control_request(self, playback_control_request: Any) -> Any:
-        return self._player.request(playback_control_request)
+        return self.owner.request(playback_control_request)
