@@ -15,7 +15,8 @@ try:
     from .align import AlignedBlock, AlignedCounts, Alignment
     from .episodes import Episode
     from .format import DamagedRecording, RecordingFailed
-    from .log import ArrayHandle, ChannelSummary, Log, LogPath, LogUpdate, open_log
+    from .log import ArrayHandle, Log, LogPath, LogUpdate, open_log
+    from .places import ChannelSummary
     from .recorder import Recorder, RecorderStatus
     from .replay import Replayer, ReplayStatus
 except ModuleNotFoundError as error:

@@ -25,7 +25,7 @@ from .episodes import Episode, episodes_of
 from .format import NEWS, Role
 from .joined import open_files
 from .log_reader import RecordedPast, RecordedStream
-from .places import Totals
+from .places import ChannelSummary, Totals
 from .stored import LOST, Reference, pruned, resolve
 from .times import LATEST, Instant, before, nanoseconds, seconds, up_to
 
@@ -92,40 +92,6 @@ class ArrayHandle:
     def read(self) -> Any:
         """Return the value, read-only; raises DamagedRecording if it is."""
         return self._load(self._stored)
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelSummary:
-    """What a channel of the file holds.
-
-    Attributes:
-        topic: What viewers call it.
-        path: The path it is about; "" if it is about the recording itself.
-        role: "update", "part", "delete", "state", "keyframe", "gap", "skip", or "".
-        kind: "pub", "stored", "kvs" or "".
-        schema: The name of its schema.
-        messages: How many.
-        bytes: Their size, before compression.
-        first: The instant of the first, 0 if there is none.
-        last: The instant of the last.
-        skipped: Why its messages are left out, in a file that another program has written; else "".
-    """
-
-    topic: str
-    path: str
-    role: str
-    kind: str
-    schema: str
-    messages: int
-    bytes: int
-    first: float
-    last: float
-    skipped: str = ""
-
-    @property
-    def rate(self) -> float:
-        """Messages a second, from the first to the last."""
-        return (self.messages - 1) / (self.last - self.first) if self.last > self.first else 0.0
 
 
 def open_log(

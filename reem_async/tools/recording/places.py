@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import NamedTuple
 
@@ -57,6 +58,40 @@ class Totals(NamedTuple):
     bytes: int = 0
     first: int = 0
     last: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSummary:
+    """What a channel of the file holds.
+
+    Attributes:
+        topic: What viewers call it.
+        path: The path it is about; "" if it is about the recording itself.
+        role: "update", "part", "delete", "state", "keyframe", "gap", "skip", or "".
+        kind: "pub", "stored", "kvs" or "".
+        schema: The name of its schema.
+        messages: How many.
+        bytes: Their size, before compression.
+        first: The instant of the first, 0 if there is none.
+        last: The instant of the last.
+        skipped: Why its messages are left out, in a file that another program has written; else "".
+    """
+
+    topic: str
+    path: str
+    role: str
+    kind: str
+    schema: str
+    messages: int
+    bytes: int
+    first: float
+    last: float
+    skipped: str = ""
+
+    @property
+    def rate(self) -> float:
+        """Messages a second, from the first to the last."""
+        return (self.messages - 1) / (self.last - self.first) if self.last > self.first else 0.0
 
 
 class Timeline:
