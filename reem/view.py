@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
 from reem_async.concurrency.queues import Policy
+from reem_async.plan.arguments import Handle
+from reem_async.plan.paths import Path
 from reem_async.store import view as core
 from reem_async.store.view import TypedUpdate
 
@@ -18,16 +20,33 @@ F = TypeVar("F")
 
 
 @documented_by(core.View)
-class View(Generic[T]):
+class View(Handle, Generic[T]):
     """One place in the dictionary, read and written as objects of a class: `arm = kvs["arm"].of(Arm)`."""
+
+    __slots__ = ("_accessor", "_core")
 
     # The accessor is of `accessor.py`, which imports this module.
     def __init__(self, accessor: Any, inner: core.View[T]) -> None:
         self._accessor = accessor
-        self._interface = accessor._interface
         self._core = inner
 
+    @property
+    def _interface(self) -> Any:
+        return self._accessor._interface
+
+    @property
+    def _place(self) -> tuple[object, Path]:
+        return self._core._place
+
+    if not TYPE_CHECKING:  # type checkers refuse it by themselves
+        __setattr__ = core.refuse_fields
+
+    def __setitem__(self, key: str | int, value: Any) -> None:
+        self[key].write(value)
+
     def __getattr__(self, name: str) -> View[Any]:
+        if name.startswith("_"):  # of an object that is being unpickled, for example
+            raise AttributeError(name)
         return self._below(getattr(self._core, name))
 
     def __getitem__(self, key: str | int) -> View[Any]:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from ..concurrency.timeouts import check_timeout, time_limit
 from ..errors import (
     BadData,
+    BadType,
     Busy,
     CallTimeout,
     ConnectionLost,
@@ -146,6 +147,15 @@ async def encoded(session: Session, names: Names, prefix: str, value: Any) -> En
     found = await Encoder(session, names.keys._replace(tag=prefix)).encoded(names.path, value)
     messages.check_parts(show((names.keys.name, *names.path)), found)
     return found
+
+
+async def encoded_objects(session: Session, names: Names, prefix: str, value: Any) -> tuple[Any, Encoded]:
+    """Return a value with what is sent in place of objects that cannot be stored as they are, and it encoded."""
+    try:
+        return value, await encoded(session, names, prefix, value)
+    except BadType:
+        value = plain(value, (names.keys.name, *names.path), session.ships.carries)
+        return value, await encoded(session, names, prefix, value)
 
 
 async def opened(session: Session, content: Content | None, prefix: str, where: str) -> Any:
@@ -376,8 +386,7 @@ class Caller(Listener):
             directory = self._directories[path] = Directory(Names(self._keys, path))
         call = PendingCall(show((self._keys.name, *path)), directory, asyncio.get_running_loop().time() + limit)
         prefix = directory.names.values(messages.CALL, call.id)
-        arguments = {name: plain(each) for name, each in arguments.items()}
-        value = await encoded(self._session, directory.names, prefix, arguments)
+        _, value = await encoded_objects(self._session, directory.names, prefix, arguments)
         self._pending[call.id] = call
         try:
             async with asyncio.timeout_at(call.deadline):

@@ -46,7 +46,7 @@ from ..pubsub.manager import manager_of
 from ..session import Session
 from ..store.publish import publisher
 from . import messages
-from .calls import Post, encoded, naming_rights, new_id, opened, publish
+from .calls import Post, encoded_objects, naming_rights, new_id, opened, publish
 from .messages import Encoded, Message, Names, Put
 
 logger = logging.getLogger("reem.services")
@@ -303,9 +303,10 @@ class Served(Listener):
             if self._loop.time() < self._recorded_until:
                 request.record = {"arguments": given}
             place = (self._names.keys.name, *self._names.path)
-            result = self._signature.result(await self._called(request, self._signature.arguments(given, place)), place)
+            result = await self._called(request, self._signature.arguments(given, place))
             del given
-            value = await encoded(self._session, self._names, prefix, result)
+            result = self._signature.result(result, place, self._session.ships.carries)
+            result, value = await encoded_objects(self._session, self._names, prefix, result)
         except BaseException as error:
             # The function may also raise CancelledError by itself. Ctrl-C ends the program, where it comes at all.
             was_cancelled = isinstance(error, asyncio.CancelledError) and (request.is_left or is_being_cancelled())

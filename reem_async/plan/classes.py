@@ -82,8 +82,11 @@ def construct(annotation: Any, values: dict[str, Any], unknown: dict[str, Any]) 
     """Return the object with these arguments. Raises what the class itself raises."""
     kind = class_of(annotation)
     if not is_pydantic(kind):
+        config = getattr(kind, "__struct_config__", None)
+        if unknown and config is not None and config.forbid_unknown_fields:
+            raise ValueError(f"it has no field {', '.join(sorted(unknown))}")
         return kind(**values)
-    if kind.model_config.get("extra") == "allow":
+    if kind.model_config.get("extra") in ("allow", "forbid"):
         values = {**unknown, **values}
     has_alias = any(each.validation_alias is not None for each in kind.model_fields.values())
     return kind.model_validate(values, **({"by_name": True} if has_alias else {}))  # which is of pydantic 2.11
@@ -114,6 +117,8 @@ def _of_dataclass(annotation: Any, kind: Any) -> dict[str, Field]:
 
 
 def _of_pydantic(kind: Any) -> dict[str, Field]:
+    if kind.__pydantic_root_model__:
+        raise BadType(f"{kind.__name__}: a RootModel has no fields of its own; use the type of its root")
     kind.model_rebuild()  # names that were defined after the class; nothing if it is complete
     fields = {}
     for name, each in kind.model_fields.items():

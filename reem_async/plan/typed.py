@@ -6,9 +6,12 @@ A class is a dict of its fields. Classes check their own constraints when an obj
 from __future__ import annotations
 
 import collections.abc
+import contextlib
 import datetime
 import decimal
 import enum
+import functools
+import inspect
 import logging
 import math
 import pathlib
@@ -16,7 +19,19 @@ import sys
 import types
 import uuid
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Final, Literal, NewType, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    NewType,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
@@ -64,10 +79,21 @@ class Mismatch(Exception):
         return f"{show(path)}: expected {expected}, found {what} ({type(found).__name__})"
 
 
-def stored(annotation: Any, value: Any, path: Path) -> Any:
-    """Return what to store of an object. Raises BadValue, which names path, expected and found, BadType or TooDeep."""
+class _Way(NamedTuple):
+    reads: bool
+    carries: Callable[[Any], Any]  # returns the ship that stores an object as it is, or None
+
+
+_READ = _Way(True, lambda _: None)
+
+
+def stored(annotation: Any, value: Any, path: Path, carries: Callable[[Any], Any] = _READ.carries) -> Any:
+    """Return what to store of an object; what a ship carries stays as it is.
+
+    Raises BadValue, which names path, expected and found, BadType or TooDeep.
+    """
     try:
-        return _convert(annotation, value, path, _Direction.WRITE)
+        return _convert(annotation, value, path, _Way(False, carries))
     except Mismatch as error:
         raise BadValue(str(error)) from None
     except RecursionError:
@@ -82,14 +108,21 @@ def made(annotation: Any, value: Any, path: Path) -> Any:
         BadType: The annotation cannot be used.
     """
     try:
-        return _convert(annotation, value, path, _Direction.READ)
+        return _convert(annotation, value, path, _READ)
     except Mismatch as error:
         raise BadData(str(error)) from None
 
 
-def plain(value: Any) -> Any:
-    """Return what to store of an object by its own class; anything but objects of classes with fields as it is."""
-    return stored(type(value), value, ()) if fields_of(type(value)) is not None else value
+def plain(value: Any, path: Path, carries: Callable[[Any], Any]) -> Any:
+    """Return a value with what to store in place of each object in it, by the object's own class."""
+    kind = type(value)
+    if kind is dict:
+        return {key: plain(each, (*path, key), carries) for key, each in value.items()}
+    if kind in (list, tuple):
+        return [plain(each, (*path, n), carries) for n, each in enumerate(value)]
+    # The class of a path is that of its system.
+    kind = next((each for each in _SCALARS if isinstance(value, each)), kind)
+    return stored(kind, value, path, carries) if _is_typed(kind) and carries(value) is None else value
 
 
 def element(annotation: Any, key: str | int, path: Path) -> Any:
@@ -100,6 +133,13 @@ def element(annotation: Any, key: str | int, path: Path) -> Any:
     """
     annotation, _ = bare(annotation)
     fields, origin, arguments = fields_of(annotation), get_origin(annotation), get_args(annotation)
+    if origin in _UNIONS:
+        found = []
+        for each in arguments:
+            with contextlib.suppress(BadType):
+                found.append(element(each, key, path))
+        if found:
+            return Union[tuple(found)]  # noqa: UP007 - of a list
     if fields is not None and key in fields:
         return fields[str(key)].annotation
     if isinstance(key, str) and origin in _DICTS:
@@ -121,6 +161,10 @@ class Signature:
     """
 
     def __init__(self, function: Any) -> None:
+        while isinstance(function, functools.partial):
+            function = function.func
+        if not (inspect.isroutine(function) or isinstance(function, type)):
+            function = getattr(function, "__call__", None)  # noqa: B004 - of an object that can be called
         hints = _hints_of(function)
         self._result = hints.pop("return", Any)
         self._arguments = {name: hint for name, hint in hints.items() if _is_typed(hint)}
@@ -132,9 +176,9 @@ class Signature:
         }
         return {**given, **typed}
 
-    def result(self, value: Any, path: Path) -> Any:
+    def result(self, value: Any, path: Path, carries: Callable[[Any], Any]) -> Any:
         """Return what to send of a result. Raises BadValue."""
-        return stored(self._result, value, path) if _is_typed(self._result) else plain(value)
+        return stored(self._result, value, path, carries) if _is_typed(self._result) else value
 
 
 def _hints_of(function: Any) -> dict[str, Any]:
@@ -157,19 +201,11 @@ def _is_typed(annotation: Any) -> bool:
     is_scalar = (
         annotation in _SCALARS
         or _is(annotation, enum.Enum)
-        or class_of(annotation) in _SETS
+        or class_of(annotation) in (*_SETS, tuple)
         or bool(_named_items(annotation))
     )
     below = get_args(annotation) if get_origin(annotation) not in (Literal, np.ndarray) else ()
     return bool(notes) or is_scalar or fields_of(annotation) is not None or any(_is_typed(each) for each in below)
-
-
-class _Direction(enum.Enum):
-    READ = enum.auto()
-    WRITE = enum.auto()
-
-
-_READ, _WRITE = _Direction.READ, _Direction.WRITE
 
 
 def _text(kind: Any) -> tuple[type, Callable[[Any], Any], Callable[[Any], Any]]:
@@ -189,6 +225,11 @@ _SCALARS: dict[Any, tuple[type | tuple[type, ...], Callable[[Any], Any], Callabl
 }
 
 
+_PLAIN = frozenset(
+    {*(str, int, float, bool, type(None), bytes, dict, list), np.ndarray}
+)  # what reading gives, but for ships
+_DTYPES = (np.generic, bool, int, float, complex)
+
 # The classes that may be annotations, and what reading makes.
 _DICTS: dict[Any, Any] = {dict: dict, collections.abc.Mapping: dict, collections.abc.MutableMapping: dict}
 _LISTS: dict[Any, Any] = {list: list, collections.abc.Sequence: list, collections.abc.MutableSequence: list}
@@ -199,9 +240,10 @@ _SETS: dict[Any, Any] = {
     collections.abc.MutableSet: set,
 }
 _ITEMS = {**_LISTS, **_SETS, tuple: tuple}
+_UNIONS = (Union, types.UnionType)
 
 
-def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
+def _convert(annotation: Any, value: Any, path: Path, way: _Way) -> Any:
     annotation, notes = bare(annotation)
     for note in notes:
         if type(note).__module__ == "msgspec":  # which has been imported then
@@ -209,7 +251,7 @@ def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
     if annotation in (Any, object) or isinstance(annotation, TypeVar):
         return value
     kind, arguments = class_of(annotation), get_args(annotation)
-    if kind in (Union, types.UnionType):
+    if kind in _UNIONS:
         return _one_of(annotation, value, path, way)
     if kind is Literal:
         if not any(type(each) is type(value) and each == value for each in arguments):
@@ -219,20 +261,35 @@ def _convert(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
         return _checked(value, type(None), path)
     if kind is np.ndarray:
         return _array(value, arguments, notes, path)
+    if kind is float:
+        return value if type(value) is float else _float(value, path)
+    if kind in (bool, int, str, bytes):
+        return _checked(value, {int: (int, np.integer), bool: (bool, np.bool_)}.get(kind, kind), path)
+    # Of what is stored, only a ship makes such an object.
+    is_object = {kind, type(value)}.isdisjoint(_PLAIN) and kind in type(value).__mro__
+    if is_object and (way.reads or way.carries(value) is not None):
+        return value
     if (fields := fields_of(annotation)) is not None:
-        return (_object if way is _READ else _dict)(annotation, fields, value, path)
+        return _object(annotation, fields, value, path) if way.reads else _dict(annotation, fields, value, path, way)
     if _is(kind, enum.Enum):
         return _member(kind, value, path, way)
     if kind in _SCALARS:
         return _scalar(kind, value, path, way)
-    if kind is float:
-        return value if type(value) is float else float(_checked(value, (int, float, np.floating, np.integer), path))
-    if kind in (bool, int, str, bytes):
-        return _checked(value, {int: (int, np.integer), bool: (bool, np.bool_)}.get(kind, kind), path)
     return _container(annotation, value, path, way)
 
 
-def _container(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
+def _float(value: Any, path: Path) -> float:
+    _checked(value, (int, float, np.floating, np.integer), path)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if number != value and not math.isnan(number):
+        raise Mismatch(path, "a float that holds it exactly", value)
+    return number
+
+
+def _container(annotation: Any, value: Any, path: Path, way: _Way) -> Any:
     kind, arguments = class_of(annotation), get_args(annotation)
     if kind in _DICTS:
         keys, values = arguments or (Any, Any)
@@ -244,9 +301,9 @@ def _container(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
         raise BadType(
             f"{show(path)}: {_name(annotation)} cannot be the type of what is stored; use dataclasses, msgspec.Struct, "
             "pydantic.BaseModel, NamedTuple, dict[str, ...], list, tuple, set, numpy arrays, numbers, text, bytes, "
-            "Enum, dates, timedelta, Path, UUID or Decimal"
+            "Enum, dates, timedelta, Path, UUID or Decimal, or a ship for this type"
         )
-    classes = collections.abc.Set if is_set and way is _WRITE else kind if named and way is _WRITE else (list, tuple)
+    classes = collections.abc.Set if is_set and not way.reads else kind if named and not way.reads else (list, tuple)
     items = [*_checked(value, classes, path)]
     kinds = (arguments[0] if arguments else Any,) * len(items)
     if named or (kind is tuple and arguments and arguments[-1] is not ...):
@@ -254,7 +311,7 @@ def _container(annotation: Any, value: Any, path: Path, way: _Direction) -> Any:
         if len(items) != len(kinds):
             raise Mismatch(path, f"{len(kinds)} items", value)
     converted = [_convert(each, it, (*path, n), way) for n, (each, it) in enumerate(zip(kinds, items, strict=True))]
-    if way is _WRITE:
+    if not way.reads:
         return converted
     try:
         return kind(*converted) if named else _ITEMS[kind](converted)
@@ -270,14 +327,14 @@ def _named_items(kind: Any) -> tuple[Any, ...]:
     return tuple(hints.get(name, Any) for name in kind._fields)
 
 
-def _one_of(union: Any, value: Any, path: Path, way: _Direction) -> Any:
+def _one_of(union: Any, value: Any, path: Path, way: _Way) -> Any:
     """Return what the first fitting choice makes of a value; of several classes, the one whose fields fit best.
 
     Raises BadType for an object that would be read as one of another choice.
     """
     choices = get_args(union)
     chosen, result = _chosen(choices, value, path, way, _name(union))
-    if way is _WRITE and len(choices) - (type(None) in choices) > 1:
+    if not way.reads and len(choices) - (type(None) in choices) > 1:
         read, _ = _chosen(choices, result, path, _READ, _name(union))
         if read is not chosen:
             raise BadType(
@@ -287,7 +344,7 @@ def _one_of(union: Any, value: Any, path: Path, way: _Direction) -> Any:
     return result
 
 
-def _chosen(choices: tuple[Any, ...], value: Any, path: Path, way: _Direction, name: str) -> tuple[Any, Any]:
+def _chosen(choices: tuple[Any, ...], value: Any, path: Path, way: _Way, name: str) -> tuple[Any, Any]:
     deepest: Mismatch | None = None
     for choice in sorted(choices, key=lambda choice: _distance(choice, value)):
         try:
@@ -338,7 +395,7 @@ def _constrained(annotation: Any, note: Any, value: Any, path: Path) -> None:
         raise Mismatch(path, f"what its Meta says ({error})", value) from None
 
 
-def _dict(annotation: Any, fields: dict[str, Field], value: Any, path: Path) -> dict[str, Any]:
+def _dict(annotation: Any, fields: dict[str, Field], value: Any, path: Path, way: _Way) -> dict[str, Any]:
     kind = class_of(annotation)
     _checked(value, kind, path)
     if type(value) is not kind and (more := (fields_of(type(value)) or {}).keys() - fields.keys()):
@@ -353,13 +410,25 @@ def _dict(annotation: Any, fields: dict[str, Field], value: Any, path: Path) -> 
         item = getattr(value, name, _NONE)
         if item is _NONE:
             raise Mismatch((*path, name), _name(field.annotation), _NONE)
-        found[name] = _convert(field.annotation, item, (*path, name), _WRITE)
+        found[name] = _convert(field.annotation, item, (*path, name), way)
         if field.use is Use.ARGUMENT:
             arguments[name] = item
     unknown = unknown_of(value)
     if checks_itself(annotation):  # an attribute may have been set since the object was made
-        _constructed(annotation, arguments, unknown, value, path)
+        again = _constructed(annotation, arguments, unknown, value, path)
+        for name, item in arguments.items():
+            if not _equal(other := getattr(again, name, item), item):
+                raise Mismatch(
+                    (*path, name), f"a value that {_name(kind)} keeps, not one of which it makes {other}", item
+                )
     return {**unknown, **found}
+
+
+def _equal(one: Any, other: Any) -> bool:
+    try:
+        return one is other or bool(np.all(one == other)) or bool(one != one)  # NaN
+    except ValueError:  # lists of arrays
+        return True
 
 
 def bare(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -380,20 +449,25 @@ def bare(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
 
 def _array(value: Any, arguments: tuple[Any, ...], notes: tuple[Any, ...], path: Path) -> Any:
     array = _checked(value, np.ndarray, path)
-    # np.typing.NDArray[np.float64] is np.ndarray[Any, np.dtype[np.float64]].
-    for note in (*notes, *(get_args(arguments[1]) if len(arguments) > 1 else ())):
-        if isinstance(note, Shape):
+    # np.typing.NDArray[np.float64] is np.ndarray[tuple[Any, ...], np.dtype[np.float64]].
+    shape, dtype = (get_args(each) for each in (*arguments, None, None)[:2])
+    if shape and shape[-1] is not ...:
+        notes = (*notes, Shape(*[get_args(each)[0] if get_origin(each) is Literal else None for each in shape]))
+    for note in (*notes, *dtype):
+        if isinstance(note, tuple) and all(each is None or type(each) is int for each in note):
             if len(note) != array.ndim or any(n not in (None, m) for n, m in zip(note, array.shape, strict=False)):
                 raise Mismatch(path, f"an array of shape {tuple(note)}", array)
         elif isinstance(note, np.dtype) and array.dtype != note:
             raise Mismatch(path, f"an array of {note}", array)
-        elif _is(note, np.generic) and not np.issubdtype(array.dtype, note):
-            raise Mismatch(path, f"an array of {note.__name__}", array)
+        elif (kinds := [each for each in get_args(note) or (note,) if _is(each, _DTYPES)]) and not any(
+            np.issubdtype(array.dtype, each) for each in kinds
+        ):
+            raise Mismatch(path, f"an array of {' or '.join(each.__name__ for each in kinds)}", array)
     return array
 
 
-def _member(kind: Any, value: Any, path: Path, way: _Direction) -> Any:
-    if way is _WRITE:
+def _member(kind: Any, value: Any, path: Path, way: _Way) -> Any:
+    if not way.reads:
         return _lists(_checked(value, kind, path).value)
     try:
         if isinstance(value, bool) and not any(isinstance(each.value, bool) for each in kind):
@@ -410,20 +484,34 @@ def _lists(value: Any) -> Any:
     return [_lists(each) for each in value] if isinstance(value, tuple) else value
 
 
-def _scalar(kind: Any, value: Any, path: Path, way: _Direction) -> Any:
+def _scalar(kind: Any, value: Any, path: Path, way: _Way) -> Any:
     of, to, make = _SCALARS[kind]
     if kind is datetime.date and isinstance(value, datetime.datetime):  # whose time would be lost
         raise Mismatch(path, "date", value)
-    if way is _WRITE:
+    if not way.reads:
         text = to(_checked(value, kind, path))
-        is_nan = isinstance(value, decimal.Decimal) and value.is_nan()
-        if not is_nan and make(text) != value:
+        if not _is_exact(text, make, value):
             raise Mismatch(path, f"a {_name(kind)} that {text!r} stands for exactly", value)
         return text
     try:
         return make(_checked(value, of, path))
     except (ValueError, ArithmeticError):
         raise Mismatch(path, _name(kind), value) from None
+
+
+def _is_exact(text: Any, make: Callable[[Any], Any], value: Any) -> bool:
+    if isinstance(value, decimal.Decimal) and value.is_nan():
+        return True
+    try:
+        again = make(text)
+        if isinstance(value, datetime.datetime) and value.utcoffset() is not None:
+            # In the hour in which clocks are put back, a time in a zone is equal to none in another zone.
+            value = value.astimezone(datetime.UTC)
+    except (ValueError, ArithmeticError):  # the longest timedelta is more than its seconds as a float
+        return False
+    # A time of day in a zone such as Europe/Berlin has no offset, and would lose its zone.
+    had_zone, has_zone = (getattr(each, "tzinfo", None) is not None for each in (value, again))
+    return bool(again == value) and had_zone == has_zone
 
 
 def _checked(value: Any, kind: Any, path: Path) -> Any:
@@ -436,7 +524,7 @@ def _checked(value: Any, kind: Any, path: Path) -> Any:
     return value.item() if isinstance(value, np.generic) and not isinstance(value, float) else value
 
 
-def _is(kind: Any, base: Any) -> bool:
+def _is(kind: Any, base: type | tuple[type, ...]) -> bool:
     return isinstance(kind, type) and issubclass(kind, base)
 
 

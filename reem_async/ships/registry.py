@@ -115,6 +115,11 @@ class Ships:
                 return each
         return None
 
+    def carries(self, value: Any) -> Registered | None:
+        """Return the ship from which readers get an object of the value's class; none if ships have to be awaited."""
+        found = None if self.asynchronous else self.fits(value)
+        return None if found is None or type(found.ship) in (NumpyShip, BytesShip) else found
+
     async def choices(self, value: Any) -> Callable[[Any], Registered | None]:
         """Return `fits` for everything inside `value`, with ships that must be awaited."""
         # By id: values need not be hashable, and equal ones may be of different types.

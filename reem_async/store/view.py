@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
 from ..concurrency.queues import Policy
 from ..concurrency.streams import Following
 from ..errors import BadData, BadType, MissingKey
 from ..plan import typed
+from ..plan.arguments import Handle, cannot_wait
 from ..plan.classes import fields_of
 from ..plan.paths import Path, show
 from ..plan.trees import MISSING
@@ -19,6 +20,13 @@ from ..pubsub.subscribers import Watch
 
 T = TypeVar("T")
 F = TypeVar("F")
+
+
+def refuse_fields(view: Any, name: str, value: Any) -> None:
+    """Refuse `arm.mode = ...`, which would write nothing."""
+    if not name.startswith("_"):
+        raise BadType(f"{show((*view._place[1], name))}: assignment does not write; use view[{name!r}].write(value)")
+    object.__setattr__(view, name, value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +57,7 @@ def selected(select: Callable[[Any], Any], path: Path) -> Path:
     return found._path
 
 
-class View(Generic[T]):
+class View(Handle, Generic[T]):
     """One place in the dictionary, read and written as objects of a class: `arm = kvs["arm"].of(Arm)`.
 
     Values are checked before they are sent and after they are read. Fields are views too: `arm.joints`, or
@@ -57,15 +65,29 @@ class View(Generic[T]):
     a method. Costs, atomicity and errors are those of the accessor.
     """
 
+    __slots__ = ("_accessor", "_annotation")
+    __setitem__ = cannot_wait("assignment", "await view[{0!r}].write(value)")
+
     # The accessor is of `accessor.py`, which imports this module.
     def __init__(self, accessor: Any, annotation: Any) -> None:
         self._accessor = accessor
         self._annotation = annotation
 
+    @property
+    def _place(self) -> tuple[object, Path]:
+        place: tuple[object, Path] = self._accessor._place
+        return place
+
+    if not TYPE_CHECKING:  # type checkers refuse it by themselves
+        __setattr__ = refuse_fields
+
     def __getattr__(self, name: str) -> View[Any]:
         if name.startswith("_"):  # what Python looks for; arm["_name"] is a field
             raise AttributeError(name)
-        return self[name]
+        try:
+            return self[name]
+        except BadType as error:
+            raise AttributeError(str(error)) from None
 
     def __getitem__(self, key: str | int) -> View[Any]:
         return View(self._accessor[key], typed.element(self._annotation, key, self._accessor.full_path))
@@ -135,7 +157,8 @@ class View(Generic[T]):
         return typed.made(self._annotation, value, self._accessor.full_path)  # type: ignore[no-any-return]
 
     def _stored(self, value: T) -> Any:
-        return typed.stored(self._annotation, value, self._accessor.full_path)
+        carries = self._accessor._place[0].ships.carries
+        return typed.stored(self._annotation, value, self._accessor.full_path, carries)
 
     def _update(self, update: Update) -> TypedUpdate[T]:
         values = {field.name: getattr(update, field.name) for field in fields(update)}
