@@ -19,7 +19,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from slots import PUBLISHERS, Work, ended, open_files, shared_memory
+from slots import PUBLISHERS, Work, ended, holders, open_files, segments
 
 import reem
 from reem_async.local import mailbox
@@ -78,7 +78,7 @@ def follow(url: str, work: Work, place: int) -> None:
 
 def soak(seed: int, updates: int) -> None:
     rng, begun = random.Random(seed), time.monotonic()
-    memory, kills = shared_memory(), 0
+    memory, kills = set[int](), 0  # inodes of shared memory, as it was when a process was killed
     with tempfile.TemporaryDirectory(dir="/tmp") as folder, EmbeddedServer() as server:
         mailbox._PARENT = folder  # other programs have sockets in the usual one
         work = Work(partial(publish, server.url), partial(follow, server.url), len(KINDS), len(COUNTED))
@@ -87,22 +87,26 @@ def soak(seed: int, updates: int) -> None:
         while work.total(SENT) < updates:
             time.sleep(rng.uniform(0.02, 0.2))
             place = rng.randrange(len(KINDS))
+            memory |= segments(processes[place].pid)
             processes[place].kill()
             ended(processes[place])
             processes[place], kills = work.started(place), kills + 1
+        memory = memory.union(*[segments(process.pid) for process in processes])
         codes = [work.end(place, process) for place, process in enumerate(processes)]
         mailbox.Mailbox(mailbox.PUBLISHER).close()
-        descriptors, left = open_files() - before, os.listdir(mailbox._path())
+        descriptors, left, having = open_files() - before, os.listdir(mailbox._path()), holders(memory)
     print(
         f"seed {seed}: {work.total(SENT)} updates, {work.total(SEEN)} seen, {work.total(EARLY)} of them early, "
         f"{kills} kills, {time.monotonic() - begun:.0f} s; {work.total(TORN)} torn, {work.total(UNEQUAL)} differ; "
-        f"{len(left)} sockets, {descriptors} descriptors, {shared_memory() - memory} MB are left"
+        f"{len(left)} sockets, {descriptors} descriptors are left, and of {len(memory)} segments {len(having)} are held"
     )
     assert codes == [0] * len(KINDS), codes
     assert work.total(EARLY) > 0
     assert (work.total(TORN), work.total(UNEQUAL)) == (0, 0)
     assert not left
     assert not descriptors
+    assert memory, "no process had shared memory"
+    assert not having, f"processes {having} hold memory of those that have ended"
 
 
 if __name__ == "__main__":

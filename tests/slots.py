@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from reem_async.local import LocalPath
-from reem_async.local.segment import SLOTS, reason_against
+from reem_async.local.segment import NAME, SLOTS, reason_against
 from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import Slot
 
@@ -96,6 +96,23 @@ def shared_memory() -> int:
     """Return the megabytes of shared memory of the whole machine."""
     with open("/proc/meminfo", encoding="ascii") as file:
         return next(int(line.split()[1]) for line in file if line.startswith("Shmem:")) >> 10
+
+
+def segments(process: object) -> set[int]:
+    """Return the inodes of the shared memory of REEM that a process has open or mapped; none if it has ended."""
+    found = set()
+    for folder in ("fd", "map_files"):
+        with contextlib.suppress(OSError):
+            for entry in os.scandir(f"/proc/{process}/{folder}"):
+                with contextlib.suppress(OSError):  # it is closed just now
+                    if os.readlink(entry.path) == f"/memfd:{NAME} (deleted)":
+                        found.add(entry.stat().st_ino)
+    return found
+
+
+def holders(memory: set[int]) -> list[int]:
+    """Return the processes of this machine that have some of this memory."""
+    return [int(it) for it in os.listdir("/proc") if it.isdigit() and segments(it) & memory]
 
 
 def publish(work: Work, place: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from browserkit import client_of, live, served
 from clikit import begins, finished, started
-from conftest import aeventually, eventually
+from conftest import aeventually, eventually, python, sized
 
 import reem
 import reem.recording
@@ -67,6 +67,61 @@ async def test_what_is_saved_equals_a_recording_made_beside_it(key, akvs, apspac
 
 def others_time(log, update):
     return next(it.time for it in log.updates() if (it.path, it.published, it.sequence) == (update[0], *update[2:]))
+
+
+ROBOT = """
+import sys, time
+import numpy as np
+from reem import Jpeg, PublishSpace, RedisInterface
+
+url, key, what, rate, seconds = *sys.argv[1:4], float(sys.argv[4]), float(sys.argv[5])
+frame = np.add.outer(np.arange(480), np.arange(640))[..., None] // 4
+frame = (frame + np.random.default_rng(1).integers(0, 40, (480, 640, 3))).astype(np.uint8)
+with RedisInterface(url) as interface:
+    place, begin, n = PublishSpace(interface)[key], time.monotonic(), 0
+    while time.monotonic() < begin + seconds:
+        image = np.roll(frame, n, 1) if what != "state" else None
+        value = {"state": n / 7, "raw": image, "jpeg": image is not None and Jpeg(image)}[what]
+        place.write({"n": n, what: value})
+        n += 1
+        time.sleep(max(0.0, begin + n / rate - time.monotonic()))
+"""
+RATES = {"raw": 30, "jpeg": 30, "state": 200}  # frames of 0.92 MB, JPEG of 90 KB
+
+
+@pytest.mark.long
+@pytest.mark.alone
+async def test_a_minute_before_a_fault_equals_a_recording_made_beside_it(key, server_url, binterface, tmp_path):
+    last, after = sized(5, 60), 5.0
+    beside = Recorder(binterface, [key("*")], tmp_path / "beside.mcap")
+    box = Recorder(binterface, [key("*")], last=last, memory=4 << 30)
+    async with beside, box:
+        words = [(key(what), what, rate, last + 2 * after) for what, rate in RATES.items()]
+        robot = [python(ROBOT, server_url, *each, flags=(), start=True) for each in words]
+        await asyncio.sleep(last + after)
+        await box.save(tmp_path / "crash.mcap", after=after)
+        assert [await asyncio.to_thread(each.communicate) for each in robot] == [("", "")] * 3
+        assert (box.status.dropped, box.status.gaps, beside.status.dropped, beside.status.gaps) == (0, 0, 0, 0)
+    with open_log(tmp_path / "crash.mcap") as saved, open_log(tmp_path / "beside.mcap") as whole:
+        for what, rate in RATES.items():
+            mine, others = news_of(saved, key(what)), news_of(whole, key(what))
+            skips = [{number for _, path, number in log.skipped() if path == key(what)} for log in (saved, whole)]
+            numbers = range(min(mine), max(mine) + 1)
+            assert len(numbers) > (last + after - 2) * rate
+            assert mine.keys() | skips[0] >= {*numbers}
+            assert others.keys() | skips[1] >= {*numbers}
+            assert all(mine[number] == others[number] for number in mine.keys() & others.keys())
+            assert len(mine.keys() & others.keys()) >= len(numbers) - len(skips[0] | skips[1])
+
+
+def news_of(log, name):
+    """Return the published updates of a key by their numbers: the time, and the value's bytes."""
+
+    def plain(it):
+        return it.data if isinstance(it, Jpeg) else it.tobytes() if isinstance(it, np.ndarray) else repr(it)
+
+    updates = [it for it in log.raw.updates(patterns=[name]) if it.kind == "pub"]
+    return {it.sequence: (it.published, hash(tuple(plain(each) for each in it.value.values()))) for it in updates}
 
 
 async def test_memory_is_bounded_and_what_goes_is_counted(key, apspace, binterface, tmp_path):

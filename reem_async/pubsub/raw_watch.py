@@ -213,7 +213,8 @@ class _Follower:
         self._is_waiting = lazy  # for the first key
         self._wires: dict[Transport, Wire] = {}
         self._news = asyncio.Event()
-        self._dirty: dict[str, int] = {}  # keys that are to be read, and how often the server has named them
+        # Keys that are to be read, and how often the server has named them: 0 if only a search has found them
+        self._dirty: dict[str, int] = {}
         # Of these, those that a search has found, and whether that was the first search
         self._found: dict[str, bool] = {}
         self._rests: dict[str, float] = {}  # when a key with a large value may be read again
@@ -338,7 +339,7 @@ class _Follower:
             if len(self._dirty) >= _MOST_KNOWN:
                 self._warn(f"over {_MOST_KNOWN} keys wait to be read, and further changes are not reported")
                 break
-            self._dirty[name] = self._dirty.get(name, 0) + 1
+            self._dirty[name] = self._dirty.get(name, 0) + (is_first is None)
             if is_first is not None:
                 self._found[name] = is_first
         self._news.set()
@@ -374,7 +375,7 @@ class _Follower:
     def _due(self, most: int, *, is_changed: bool) -> list[str]:
         """Return keys that may be read now: such as the server has named, or such as only a search has found."""
         now = asyncio.get_running_loop().time()
-        wanted = (it for it, count in self._dirty.items() if (count > 1 or it not in self._found) is is_changed)
+        wanted = (it for it, count in self._dirty.items() if bool(count) is is_changed)
         return list(islice((name for name in wanted if self._rests.get(name, 0.0) <= now), most))
 
     async def _read(self, names: list[str]) -> None:
@@ -390,7 +391,7 @@ class _Follower:
                 self._warn(str(it))
             else:
                 failure = it
-                self._dirty[name] = counts[name]
+                self._dirty[name] = self._dirty.get(name, 0) + counts[name]
         if failure is not None:
             raise failure
 
@@ -422,7 +423,7 @@ class _Follower:
             deleted=is_gone,
             kind=it.kind,
             size=it.size,
-            changes=changes,
+            changes=max(changes, 1),
         )
         self.queue.put(update)
 
