@@ -98,7 +98,8 @@ def soak(seed: int, updates: int) -> None:
     print(
         f"seed {seed}: {work.total(SENT)} updates, {work.total(SEEN)} seen, {work.total(EARLY)} of them early, "
         f"{kills} kills, {time.monotonic() - begun:.0f} s; {work.total(TORN)} torn, {work.total(UNEQUAL)} differ; "
-        f"{len(left)} sockets, {descriptors} descriptors are left, and of {len(memory)} segments {len(having)} are held"
+        f"{len(left)} sockets, {descriptors} descriptors are left; {len(having)} processes hold one of "
+        f"{len(memory)} segments"
     )
     assert codes == [0] * len(KINDS), codes
     assert work.total(EARLY) > 0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from browserkit import client_of, live, served
 from clikit import begins, finished, started
-from conftest import aeventually, eventually, python, sized
+from conftest import aeventually, eventually, python
 
 import reem
 import reem.recording
@@ -92,7 +92,7 @@ RATES = {"raw": 30, "jpeg": 30, "state": 200}  # frames of 0.92 MB, JPEG of 90 K
 @pytest.mark.long
 @pytest.mark.alone
 async def test_a_minute_before_a_fault_equals_a_recording_made_beside_it(key, server_url, binterface, tmp_path):
-    last, after = sized(5, 60), 5.0
+    last, after = 60, 5.0
     beside = Recorder(binterface, [key("*")], tmp_path / "beside.mcap")
     box = Recorder(binterface, [key("*")], last=last, memory=4 << 30)
     async with beside, box:

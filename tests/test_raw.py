@@ -173,6 +173,9 @@ def test_all_keys_of_a_pattern_are_told_first_and_then_what_changes(watching, fr
     kvs[key("a_document")]["n"] = 2
     raw.set(key("a1"), "[1, 2]")
     assert watch.told() == ("stored", key("a1"), [1, 2], False)
+    for text, value in (("3", 3), ("x" * 5000, "x" * 5000), ("4", 4), ("5", 5), ("", ""), ("6", 6)):
+        raw.set(key("a1"), text)
+        assert watch.told() == ("stored", key("a1"), value, False)
     raw.hset(key("a2"), "volts", "24.5")
     assert watch.told() == ("stored", key("a2"), {"volts": 24.5}, False)
     raw.delete(key("a1"))

@@ -22,6 +22,7 @@ from .paths import shorten
 from .placeholders import Unfetched
 from .sizes import LARGE
 
+SHORT = 1 << 12  # bytes below which a string is read without asking for its type first
 LARGEST = 64 << 20  # bytes of a key that are fetched unless another number is given
 _DEEPEST = 128  # levels of JSON that are decoded; text that is nested deeper stays text
 _ATTEMPTS = 5  # to read a key that changes its type each time
@@ -169,6 +170,19 @@ def read(name: str, largest: float = LARGEST, attempts: int = _ATTEMPTS) -> Plan
     if not attempts:
         raise WrongType(f"{name} changed its type {_ATTEMPTS} times while it was read; read it again")
     return Plan(look(name), decode)
+
+
+def read_short(name: str, largest: float = LARGEST) -> Plan:
+    """Plan to read a key that was a short string, as `read`: one round trip if it still is, else three."""
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        data = replies[0]
+        # Without the JSON module a document of REEM is a string too, which begins with a space.
+        if isinstance(data, bytes) and 0 < len(data) < min(SHORT, largest) and data[:1] != b" ":
+            return RawValue("string", plain_value(data), len(data))
+        return read(name, largest)
+
+    return Plan([("GETRANGE", name, "0", str(SHORT - 1))], decode)
 
 
 def look(name: str) -> list[Command]:

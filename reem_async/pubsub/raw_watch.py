@@ -26,7 +26,7 @@ from ..errors import InterfaceClosed, NotAllowed, RedisError, ReemError, WrongTy
 from ..plan import Plan, blamed
 from ..plan.keys import DOCUMENT
 from ..plan.paths import Pattern
-from ..plan.raw import RawValue, kinds_of, raw_name, read
+from ..plan.raw import SHORT, RawValue, kinds_of, raw_name, read, read_short
 from ..session import Session
 from ..transport import Transport, scanned
 from ..transport.aio import AsyncTransport
@@ -218,7 +218,8 @@ class _Follower:
         # Of these, those that a search has found, and whether that was the first search
         self._found: dict[str, bool] = {}
         self._rests: dict[str, float] = {}  # when a key with a large value may be read again
-        self._known: dict[str, None] = {}  # keys that were there when they were last read
+        # Keys that were there when they were last read, and whether each was a short string
+        self._known: dict[str, bool] = {}
         self._documents: dict[str, float] = {}  # keys with documents of REEM, and when that was found
         self._next_look = 0.0
         self._is_first = True
@@ -381,7 +382,8 @@ class _Follower:
     async def _read(self, names: list[str]) -> None:
         counts = {name: self._dirty.pop(name) for name in names}  # first: what changes from now on is read again
         run = self._session.run
-        found = await asyncio.gather(*[run(read(name, self._largest)) for name in names], return_exceptions=True)
+        plans = [(read_short if self._known.get(name) else read)(name, self._largest) for name in names]
+        found = await asyncio.gather(*[run(each) for each in plans], return_exceptions=True)
         failure: BaseException | None = None
         for name, it in zip(names, found, strict=True):
             if isinstance(it, RawValue):
@@ -408,7 +410,7 @@ class _Follower:
             if not was_known:
                 return
         elif was_known or len(self._known) < _MOST_KNOWN:
-            self._known[name] = None
+            self._known[name] = it.kind == "string" and it.size < SHORT
         if it.size >= _SLOW:
             self._rests[name] = asyncio.get_running_loop().time() + it.size / self.rate
         gap = is_first is False

@@ -68,8 +68,9 @@ class _Pool(redis.ConnectionPool):
         _pools.add(self)
 
     def _forked(self) -> None:
-        for holder, name in ((self, "_lock"), (self, "_fork_lock"), (self._event_dispatcher, "_lock")):
-            setattr(holder, name, threading.RLock())
+        for holder in filter(None, (self, getattr(self, "_event_dispatcher", None))):  # names of redis-py 8.1
+            for name in {"_lock", "_fork_lock"} & vars(holder).keys():
+                setattr(holder, name, threading.RLock())
 
 
 _pools = Inherited(_Pool._forked)

@@ -101,7 +101,7 @@ class RawFollower:
     def note(self) -> str:
         """What a page says of keys that it does not show."""
         if self._watch.is_partial:
-            return f"of keys of programs without REEM {MOST} are shown, and others once they change"
+            return f"{MOST} keys of programs without REEM are shown; others appear when they change"
         return self._refused
 
     def shown_on(self, pages: int) -> None:
