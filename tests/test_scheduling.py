@@ -29,7 +29,7 @@ def test_memory_that_is_kept_is_not_taken_page_by_page_again() -> None:
 
 _TURN = """
 import ctypes, os, struct, threading
-from reem_async.concurrency.tasks import take_short_turns
+from reem_async.concurrency.tasks import come_last, take_short_turns
 def turn():
     "Policy, flags, niceness and turn in nanoseconds of this thread, as Linux tells them."
     got = ctypes.create_string_buffer(48)
@@ -51,7 +51,9 @@ def told(*first):
     return said
 os.nice(3)
 batch = lambda: os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-print([told(), told(take_short_turns), told(batch, take_short_turns)])
+threads = told(), told(take_short_turns), told(batch, take_short_turns), told(come_last)
+session = "/proc/self/autogroup"
+print([*threads, open(session).read().split()[-1] if os.path.exists(session) else "19"])
 """
 
 
@@ -59,11 +61,14 @@ print([told(), told(take_short_turns), told(batch, take_short_turns)])
     sys.platform != "linux" or tuple(map(int, platform.release().split(".")[:2])) < (6, 12),
     reason="Linux from 6.12 on: elsewhere nothing is done",
 )
-def test_short_turns_are_for_one_ordinary_thread() -> None:
-    said = subprocess.run([sys.executable, "-c", _TURN], capture_output=True, text=True, check=True).stdout
-    (before, _), (short, of_its_thread), (of_batch, _) = ast.literal_eval(said)
+def test_short_turns_are_for_one_ordinary_thread_or_with_lowest_priority_for_all_later_ones() -> None:
+    command = [sys.executable, "-c", _TURN]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, start_new_session=True).stdout
+    (before, _), (short, of_its_thread), (of_batch, _), last, session = ast.literal_eval(said)
     policy, _, nice, _, turn = before
     assert turn > 100_000
     assert short == (policy, 1, nice, 0, 100_000)
     assert of_its_thread == before
     assert of_batch[-1] == turn
+    assert last == [(policy, 0, 19, 0, 100_000)] * 2
+    assert session == "19"  # niceness counts within a session only, where Linux groups programs by it

@@ -72,6 +72,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # what glibc's mallopt calls them
 _SET_ATTRIBUTES = {"x86_64": 314, "aarch64": 274}  # Linux's system call sched_setattr, which the C library lacks
 # SCHED_FLAG_RESET_ON_FORK: programs that this one starts are scheduled as usual.
 _RESET_ON_FORK = 1
+_SESSION = "/proc/self/autogroup"  # the niceness of all programs of a session together
 _SHORTEST_TURN = 100_000  # nanoseconds; the least that the kernel accepts as a time slice
 
 
@@ -101,16 +102,33 @@ def stand_back() -> None:
         os.nice(_NICEST)
 
 
-def take_short_turns() -> None:
-    """Have this thread, but none that it begins, take turns of 0.1 ms, where that can be: Linux from 6.12 on.
+def come_last() -> None:
+    """Come after all other programs for the processor from now on, with all threads begun later, where that can be.
 
-    When it is woken it comes before threads with longer turns. One with another policy is left as it is.
+    Niceness decides how much a thread gets. A thread that was woken waits up to a whole turn of any other, 1.4 ms by
+    default, so the turns are short. Linux with autogroup=1 shares processors among sessions first, where niceness
+    counts for nothing: a process that leads its session, such as a service, also lowers the session.
+    """
+    with contextlib.suppress(AttributeError, OSError):
+        os.nice(_NICEST)
+    take_short_turns(inherited=True)
+    with contextlib.suppress(AttributeError, OSError):
+        if os.getsid(0) == os.getpid():
+            with open(_SESSION, "w", encoding="ascii") as file:
+                file.write(str(_NICEST))
+
+
+def take_short_turns(*, inherited: bool = False) -> None:
+    """Have this thread, and if `inherited` those that it begins, take turns of 0.1 ms: Linux from 6.12 on.
+
+    When it is woken it comes before threads of its niceness with longer turns. Not with another policy.
     """
     if sys.platform != "linux" or sys.maxsize < 1 << 32 or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return
     if number := _SET_ATTRIBUTES.get(os.uname().machine):
         nice = os.getpriority(os.PRIO_PROCESS, 0)
-        wish = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, _RESET_ON_FORK, nice, 0, _SHORTEST_TURN, 0, 0)
+        flags = 0 if inherited else _RESET_ON_FORK
+        wish = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, flags, nice, 0, _SHORTEST_TURN, 0, 0)
         with contextlib.suppress(AttributeError, OSError):
             ctypes.CDLL(None).syscall(ctypes.c_long(number), 0, ctypes.c_char_p(wish), 0)
 

@@ -32,7 +32,7 @@ from ..transport.wire import Wire
 from .events import Origin, Update
 from .listeners import Beginning, Listener, Topic, contained
 from .manager import SubscriptionManager
-from .refresh import LIVE, RefreshTimer
+from .refresh import LIVE, Pace, RefreshTimer
 from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replica, Skipped, Snapshot, Stored, Updated
 
 logger = logging.getLogger("reem.subscribe")
@@ -58,6 +58,7 @@ class Follower(Listener):
         largest: float = math.inf,
         heartbeat: float = math.inf,
         ttl: float | None = None,
+        pace: Pace = LIVE,
     ) -> None:
         super().__init__(Topic(keys.channel.encode()))
         self.keys = keys
@@ -75,7 +76,7 @@ class Follower(Listener):
         self._replica = Replica(keys, path, ships, cache, largest)
         self._wire: Wire | None = None
         self._loop = asyncio.get_running_loop()
-        self._looks = RefreshTimer(self, Follower._look, LIVE)
+        self._looks = RefreshTimer(self, Follower._look, pace)
         self._asked = 0.0  # when a read was sent last
         self._valid_at = -math.inf  # the server had what is in the copy then, or later
         self._probe_due = 0.0

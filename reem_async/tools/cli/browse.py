@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ...concurrency.tasks import come_last
 from ...connection import RedisInterface
 from ...errors import ServerFailed
 from ...server import EmbeddedServer
@@ -128,8 +129,7 @@ async def _serve(source: Source, host: str, port: int, allow_write: bool, open_:
         _tell(source, address, alone, allow_write)
         if open_:
             open_page(address)
-        with suppress(AttributeError, OSError):
-            os.nice(19)  # a robot's programs come first; not before the web browser is opened, which would inherit it
+        come_last()  # not before the web browser is opened, which would inherit it
         await PageServer(app, sock).run_until_stopped()
     finally:
         sock.close()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -26,7 +25,7 @@ from ...plan.reads import first_read, read
 from ...pubsub.events import Update
 from ...pubsub.follower import Follower
 from ...pubsub.manager import SubscriptionManager
-from ...pubsub.refresh import find_regularly, present_keys
+from ...pubsub.refresh import BACKGROUND, find_regularly, present_keys
 from ...pubsub.subscribers import Link
 from ...session import Session
 from ...store.document import opened
@@ -63,12 +62,6 @@ def top_patterns(texts: Sequence[str]) -> list[Pattern]:
     return patterns
 
 
-def lower_priority() -> None:
-    """Have this thread and those that it begins come behind all programs of the robot."""
-    with suppress(AttributeError, OSError):
-        os.nice(19)
-
-
 def time_of(update: Update) -> int:
     """Return when an update was published, in ns since 1970; now if that is not known or its clock is wrong."""
     now = time.time()
@@ -89,7 +82,9 @@ class ViewedKey:
     def _follower(self, session: Session, manager: SubscriptionManager) -> Follower:
         largest = math.inf if self.arrays else SMALL
         keys = session.keys(self.name)
-        follower = Follower(keys, (), session.ships, session.cache, manager, stored=True, largest=largest)
+        follower = Follower(
+            keys, (), session.ships, session.cache, manager, stored=True, largest=largest, pace=BACKGROUND
+        )
         follower.max_batch_delay = TICK
         return follower
 

@@ -14,13 +14,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...concurrency.queues import Last
+from ...concurrency.tasks import come_last
 from ...connection import RedisInterface
 from ...coordination.parameters import SPECIFICATIONS, StoredParameter, publish, stored_parameters
 from ...coordination.specification import as_json
 from ...errors import NotAllowed, RedisError, ReemError, ServerFailed
 from ...plan.paths import Path, show
 from ...plan.trees import MISSING
-from .base import Viewer, extra, lower_priority
+from .base import Viewer, extra
 from .topics import Topics
 
 logger = logging.getLogger("reem.foxglove")
@@ -92,7 +93,7 @@ class FoxgloveViewer(Viewer):
         allow_write: bool = False,
     ) -> None:
         super().__init__(interface, patterns, lambda: Last(_WAITING))
-        lower_priority()  # before the server begins its threads, which inherit it
+        come_last()  # before the server begins its threads, which inherit it
         foxglove = extra("foxglove", "foxglove-sdk")
         self._foxglove = foxglove
         self._topics = Topics(foxglove, rate, self.skipped)

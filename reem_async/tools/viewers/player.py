@@ -11,11 +11,12 @@ from contextlib import suppress
 from operator import itemgetter
 from typing import Any
 
+from ...concurrency.tasks import come_last
 from ...errors import BadValue
 from ...plan.trees import MISSING
 from ..recording.log import Log
 from ..recording.times import nanoseconds
-from .base import TICK, extra, lower_priority, top_patterns
+from .base import TICK, extra, top_patterns
 from .foxglove import Bridge
 from .topics import Topics
 
@@ -37,7 +38,7 @@ class FoxglovePlayer:
     def __init__(
         self, log: Log, patterns: Sequence[str] = (), *, host: str = "127.0.0.1", port: int = 8765, rate: float = 30.0
     ) -> None:
-        lower_priority()
+        come_last()
         self._foxglove: Any = extra("foxglove", "foxglove-sdk")
         self._log = log.raw  # pictures are passed on as they are
         tops = top_patterns(patterns)

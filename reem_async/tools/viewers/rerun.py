@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from ...concurrency.queues import Newest
+from ...concurrency.tasks import come_last
 from ...connection import RedisInterface
 from ...errors import BadValue, ServerFailed
 from ...plan.paths import Path
@@ -19,7 +20,7 @@ from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
 from ...ships.images import EncodedImage
 from ..recording.layout import is_picture, picture_format
-from .base import Viewer, extra, lower_priority
+from .base import Viewer, extra
 
 _EXAMPLE = "rerun+http://127.0.0.1:9876/proxy"
 _PORT = 9876  # of an address without one
@@ -45,7 +46,7 @@ class RerunViewer(Viewer):
 
     def __init__(self, interface: RedisInterface, patterns: Sequence[str] = (), *, rate: float = 30.0) -> None:
         super().__init__(interface, patterns, Newest)
-        lower_priority()  # before Rerun begins its threads, which inherit it
+        come_last()  # before Rerun begins its threads, which inherit it
         self._rerun: Any = extra("rerun", "rerun-sdk")
         self._recording = self._rerun.RecordingStream("reem")
         # The first entry takes a second, in which Rerun imports most of itself: not while updates wait.
