@@ -74,13 +74,13 @@ class Loader(yaml.SafeLoader):
 def _entry(loader: Loader, node: yaml.MappingNode) -> Entry:
     file = Path(node.start_mark.name).name
     pairs = loader.construct_pairs(node, deep=True)
-    entry = Entry(pairs)
+    entry = Entry((str(key), value) for key, value in pairs)
     entry.where = f"{file}:{node.start_mark.line + 1}"
-    entry.lines = {key.value: key.start_mark.line + 1 for key, _ in node.value}
+    entry.lines = {str(key.value): key.start_mark.line + 1 for key, _ in node.value}
     if len(entry) < len(pairs):
-        names = [key for key, _ in pairs]
+        names = [str(key) for key, _ in pairs]
         twice = next(key for n, key in enumerate(names) if key in names[:n])
-        raise entry.wrong(f"{twice!r} is there twice; remove one", str(twice))
+        raise entry.wrong(f"{twice!r} is there twice; remove one", twice)
     return entry
 
 
@@ -108,12 +108,12 @@ QOS_NAMES: dict[str, dict[str, Any]] = {
 }
 
 
-def checked(entry: Any, keys: str, parent: Entry | None = None) -> Entry:
+def checked(entry: Any, keys: str, parent: Entry | None = None, where: str = "") -> Entry:
     """Return an entry if it has what it must and nothing unknown."""
     known = keys.replace("!", "").split()
     if not isinstance(entry, Entry):
         found = f"{entry!r:.60} is not a mapping; use {', '.join(known)}"
-        raise parent.wrong(found) if parent is not None else Wrong(found)
+        raise parent.wrong(found) if parent is not None else Wrong(f"{where}: {found}")
     for key, value in entry.items():
         if key not in known:
             raise entry.wrong(f"unknown key {key!r}; use {', '.join(known)}", key)
@@ -131,10 +131,11 @@ def checked(entry: Any, keys: str, parent: Entry | None = None) -> Entry:
 def load(file: str) -> Entry:
     """Return the checked file. Raises Wrong, which names file and line."""
     try:
-        with open(file, encoding="utf-8") as stream:
-            found = checked(yaml.load(stream, Loader), FILE)
+        with open(file, "rb") as stream:
+            content = yaml.load(stream, Loader)
     except (OSError, yaml.YAMLError) as error:
         raise Wrong(f"{file}: {error}") from None
+    found = checked(content, FILE, where=file)
     topics = [checked(each, TOPIC, found) for each in found.setdefault("topics", [])]
     parameters = [checked(each, PARAMETER, found) for each in found.setdefault("parameters", [])]
     for each in topics:
@@ -188,7 +189,7 @@ def message_class(name: str, wrong: Callable[[str], Exception] = LookupError) ->
     package, _, kind = name.replace("/msg/", "/").partition("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), kind)
-    except (ImportError, AttributeError, ValueError):
+    except (ImportError, AttributeError, ValueError, TypeError):
         raise wrong(f"there is no message type {name!r}; source the workspace that has it") from None
 
 
@@ -266,7 +267,7 @@ def from_dict(kind: Any, value: Any, path: str) -> Any:
             raise ValueError(f"{path}: {kind.__name__} has no field {name!r}; it has {', '.join(fields)}")
         try:
             setattr(message, name, _field(fields[name], each, f"{path}.{name}"))
-        except (TypeError, OverflowError) as error:
+        except (TypeError, OverflowError, AssertionError) as error:
             found = f"{each.dtype}{list(each.shape)}" if isinstance(each, np.ndarray) else f"{each!r:.60}"
             raise ValueError(f"{path}.{name}: expected {fields[name]}, found {found} ({error!s:.200})") from None
     return message
@@ -294,7 +295,7 @@ def _field(text: str, value: Any, path: str) -> Any:
     if isinstance(value, bool | str):
         raise TypeError("it is no number")
     if kind in ("double", "float"):
-        return float(value)
+        return float(_numbers(NUMBERS[kind], [float(value)], path, 1)[0])
     number = operator.index(value)
     limits = np.iinfo(NUMBERS.get(kind, "u1"))
     if not limits.min <= number <= limits.max:
@@ -307,9 +308,10 @@ def _numbers(form: str, value: Any, path: str, length: int | None) -> Any:
     given = np.asarray(value)
     if given.ndim != 1 or (given.size and given.dtype.kind not in "iuf"):
         raise TypeError("it is no list of numbers")
-    with np.errstate(invalid="ignore"):  # what does not fit is refused below
+    with np.errstate(invalid="ignore", over="ignore"):  # what does not fit is refused below
         numbers = given.astype(form)
-    if numbers.dtype.kind in "iu" and not np.array_equal(numbers, given):
+    is_float = numbers.dtype.kind == "f"  # which loses digits, but does not become infinite
+    if not np.array_equal(*((np.isinf(numbers), np.isinf(given)) if is_float else (numbers, given))):
         raise ValueError(f"{path}: some numbers do not fit {numbers.dtype}")
     if length is not None:
         return numbers
@@ -472,6 +474,8 @@ class Bridge:
                 del self._due[pair]
             try:
                 pair.agree(has_begun)
+            except reem.BadInput as error:  # NaN, for example
+                self.report(pair.entry, f"the value in ROS was not stored: {error}")
             except (reem.ReemError, RedisError) as error:
                 self.report(pair.entry, f"trying again: {error}")
                 self._is_due(pair, has_begun)

@@ -147,7 +147,12 @@ class Accessor(Handle):
     own = makes(core.Accessor.own, lambda interface, inner: OwnedAccessor(interface, inner))
     _ipython_key_completions_ = known_keys
 
-    def of(self, kind: builtins.type[T]) -> View[T]:
+    @overload
+    def of(self, kind: builtins.type[T]) -> View[T]: ...
+    @overload
+    def of(self, kind: Any) -> View[Any]: ...
+
+    def of(self, kind: Any) -> View[Any]:
         """Return this place as objects of a class."""
         return View(self, self._core.of(kind))
 

@@ -152,6 +152,8 @@ def test_an_array_alone_is_an_image_and_a_picture_in_another_encoding_stays_byte
         ("test_msgs/All", {"few": [1.0] * 3}, "p.few: 3 items in sequence<double, 2>"),
         ("test_msgs/All", {"short": "hello"}, "p.short: 5 characters in string<4>"),
         ("test_msgs/All", {"a_boolean": 1}, "p.a_boolean: expected boolean, found 1 (it is no boolean)"),
+        ("test_msgs/All", {"a_float": 1e39}, "p.a_float: some numbers do not fit float32"),
+        ("test_msgs/All", {"floats": [0.0, 1e39]}, "p.floats: some numbers do not fit float32"),
         ("std_msgs/Float64", "far", "p.data: expected double, found 'far' (it is no number)"),
     ],
     ids=str,
@@ -171,7 +173,13 @@ TWIST = "topics:\n- topic: /cmd\n  type: geometry_msgs/msg/Twist\n  path: cmd\n 
     ("text", "message"),
     [
         ("topic: x", "b.yaml:1: unknown key 'topic'; use server, namespace, topics, parameters"),
-        ("[1, 2]", "[1, 2] is not a mapping"),
+        ("[1, 2]", "b.yaml: [1, 2] is not a mapping"),
+        ("[", "b.yaml"),
+        ("topics: [{[a]: 1}]", "b.yaml:1: unknown key \"['a']\"; use topic"),
+        (
+            TWIST.replace("geometry_msgs", "/geometry_msgs"),
+            "b.yaml:3: there is no message type '/geometry_msgs/msg/Twist'",
+        ),
         ("topics: [1]", "b.yaml:1: 1 is not a mapping; use topic, type, path, direction, qos, ttl"),
         ("topics:\n- topic: /a\n  type: t\n  path: p", "b.yaml:2: direction is missing"),
         (TWIST.replace("to_ros", "both"), "b.yaml:5: direction is 'both'; use from_ros or to_ros"),
@@ -333,6 +341,8 @@ def test_parameters_go_both_ways(running, graph, caplog):
     assert "b.yaml:5: mode = 7 was refused by ROS: Wrong parameter type, expected str" in caplog.text
     kvs["control"]["kp"] = {"no": "parameter"}
     agree({"kp": 4.0, "speed": 0.5, "mode": "track"})
+    controller.set_parameters([rosstub.Parameter("gains.kp", value=math.nan)])
+    eventually(lambda: "b.yaml:3: the value in ROS was not stored: control.kp: nan is not JSON" in caplog.text)
     # Both sides at once, again and again: in the end they agree.
     for number in range(sized(20, 200)):
         controller.set_parameters([rosstub.Parameter("gains.kp", value=float(number))])

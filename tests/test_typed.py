@@ -278,6 +278,8 @@ def test_a_view_reads_writes_edits_and_follows(kvs, pspace, key):
     assert kvs[name]["next"].of(Node).next.value.read() == 2  # of a class or None
     with pytest.raises(reem.BadType, match="lambda"):
         arm.at(lambda it: 3)
+    with pytest.raises(reem.BadType, match=f"{name}: of.'Arm'. names no class"):
+        kvs[name].of("Arm")
 
 
 async def test_a_view_in_asyncio(akvs, apspace, key):
@@ -737,9 +739,9 @@ def test_an_object_that_contains_itself_is_refused(kvs, key):
 
 PROGRAM = """
     import dataclasses
-    from typing import assert_type
+    from typing import Any, assert_type
     import numpy as np
-    import reem, reem_async
+    import reem, reem.view, reem_async
 
     @dataclasses.dataclass
     class Arm:
@@ -761,6 +763,7 @@ PROGRAM = """
         with arm.edit() as value:
             assert_type(value, Arm)
         arm["speed"] = 1.0
+        assert_type(kvs["maybe"].of(Arm | None), reem.view.View[Any])
         arm.speed = 1.0  # wrong
         arm.write(3)  # wrong
         assert_type(kvs["plan"].of(Arm).call(goal=Arm(1.0, [])), Arm)

@@ -125,6 +125,13 @@ def plain(value: Any, path: Path, carries: Callable[[Any], Any]) -> Any:
     return stored(kind, value, path, carries) if _is_typed(kind) and carries(value) is None else value
 
 
+def check_annotation(annotation: Any, path: Path) -> None:
+    """Raise BadType for what is neither a class nor an annotation, such as its name."""
+    inner, _ = bare(annotation)
+    if not (isinstance(inner, type) or inner in (None, Any) or get_origin(inner) is not None):
+        raise BadType(f"{show(path)}: of({shorten(annotation)}) names no class; use a class or an annotation")
+
+
 def element(annotation: Any, key: str | int, path: Path) -> Any:
     """Return the annotation of an element: a field of a class, a value of a dict, an item of a list.
 

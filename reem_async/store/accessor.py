@@ -21,6 +21,7 @@ from ..errors import BadKey, BadType, MissingDocument, MissingKey, Misuse, Wrong
 from ..plan.arguments import Handle, cannot_wait
 from ..plan.documents import number_text
 from ..plan.paths import Path, check_element, check_name, parse, show
+from ..plan.typed import check_annotation
 from ..pubsub.mirror import Mirror
 from ..pubsub.subscribers import Watch
 from .catalog import Outline, outline
@@ -593,13 +594,22 @@ class Accessor(Handle):
         lease = Lease(session, self._reader.keys, ttl, name, take)
         return OwnedAccessor(self._reader, OwnedPublisher(lease, session), ())
 
-    def of(self, kind: builtins.type[T]) -> View[T]:
+    @overload
+    def of(self, kind: builtins.type[T]) -> View[T]: ...
+    @overload
+    def of(self, kind: Any) -> View[Any]: ...
+
+    def of(self, kind: Any) -> View[Any]:
         """Return this place as objects of a class: `arm = kvs["arm"].of(Arm)`, `await arm.read()`.
 
         Args:
             kind: A dataclass, `msgspec.Struct` or `pydantic.BaseModel`, or an annotation, such as `list[Arm]`. See
                 docs/howto/typed.md for the types that fields may have.
+
+        Raises:
+            BadType: It is no class and no annotation.
         """
+        check_annotation(kind, self.full_path)
         return View(self, kind)
 
     def __reduce__(self) -> tuple[Any, ...]:
