@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 import pytest
-from clikit import begins, finished, started
+from clikit import begins, finished, invoked, started
 from conftest import assert_same, sized
 
 from reem_async import KeyValueStore, PublishSpace
@@ -81,6 +81,9 @@ async def test_each_file_by_itself_and_all_as_one(ainterface, key, tmp_path):
         news = [update for update in log.updates() if update.path == (f"{name}static",)]
         assert len(news) == 1, "what a file begins with is no news"
         assert_same(log.value_at("", log.end), last)
+    for given in (files, files[-1:]):
+        said = (await asyncio.to_thread(invoked, "log", "info", *map(str, given))).stdout
+        assert ("counted from the first file" in said) == (given != files)
     with open_log([files[0], files[-1]]) as log:  # what the last one begins with is news without those between
         assert_same(log.value_at("", log.end), last)
 

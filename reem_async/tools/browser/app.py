@@ -180,7 +180,7 @@ class CancelledWithPage:
 
 
 async def _nothing() -> Message:
-    """Wait for a message that does not come: the request was read, and `CancelledWithPage` hears when its page goes."""
+    """Wait until cancelled: the request has been read, and `CancelledWithPage` detects that its page has gone."""
     await anyio.sleep_forever()
     return {"type": "http.disconnect"}
 

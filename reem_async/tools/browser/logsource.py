@@ -279,7 +279,7 @@ class LogSource(Source):
         raise ReadOnly("a recording cannot be changed; share a layout by its link")
 
     def hint(self, path: Path, text: str) -> None:
-        raise ReadOnly("what bytes are can be said on the page of a server, and not of a recording")
+        raise ReadOnly("the type of bytes cannot be set for a recording; set it on the page of the server")
 
 
 class _Columns(NamedTuple):

@@ -281,7 +281,12 @@ def _missing(log: Log) -> str:
     worst = [
         f"{key.removeprefix('not recorded: ')} {value}" for key, value in counts.items() if key.startswith("not rec")
     ]
-    return text + (f" ({', '.join(worst[:5])})" if worst else "")
+    # Of a part of a recording, the counts are those of all parts until its end.
+    part = log.metadata.get("split", "").rpartition(" ")[2]
+    since = (
+        ", counted from the first file of the recording on" if part.isdecimal() and int(part) > len(log.files) else ""
+    )
+    return text + (f" ({', '.join(worst[:5])})" if worst else "") + since
 
 
 def _when(instant: float) -> str:

@@ -214,7 +214,7 @@ def _is_repeated(field: Any) -> bool:
 
 # Pictures: the field `data` of these messages becomes what the picture is.
 
-# Names of ROS and of Foxglove -> dtype and channels; with bgr, the channels are turned round.
+# Names of ROS and of Foxglove -> dtype and channels; with bgr, the channels are reversed.
 _PICTURES = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3), "rgba8": ("u1", 4),
     "bgra8": ("u1", 4), "8UC4": ("u1", 4), "mono16": ("u2", 1), "16UC1": ("u2", 1), "32FC1": ("f4", 1),

@@ -44,7 +44,7 @@ class Role(StrEnum):
     SAMPLE = "sample"
     """What was read at a path in turn; in the file an update or a deletion."""
     SPLIT = "split"
-    """From here on another file is written."""
+    """The next file begins."""
     FOUND = "found"
     """What a read found at the place of a skipped update; in the file an update or a deletion."""
 

@@ -155,7 +155,7 @@ Files = Container | Joined
 
 
 def open_files(paths: Any, progress: Callable[[int, int], None] | None = None) -> Files:
-    """Open one file, or several; raises DamagedRecording, OSError, and BadType or BadValue otherwise."""
+    """Open one file, or several; raises DamagedRecording, OSError, and BadType or BadValue for other arguments."""
     if isinstance(paths, str | FilePath):
         return Container(FilePath(paths), progress)
     if not isinstance(paths, Sequence) or isinstance(paths, bytes) or not paths:
@@ -166,7 +166,7 @@ def open_files(paths: Any, progress: Callable[[int, int], None] | None = None) -
             files.append(Container(path, progress))
             twice = [file.path for file in files[:-1] if os.path.samefile(file.path, path)]
             if twice:
-                raise BadValue(f"{path} and {twice[0]} are one file: its updates would be there twice")
+                raise BadValue(f"{path} and {twice[0]} are one file: its updates would be there twice; give it once")
         return files[0] if len(files) == 1 else Joined(files)
     except BaseException:
         for file in files:
@@ -175,7 +175,7 @@ def open_files(paths: Any, progress: Callable[[int, int], None] | None = None) -
 
 
 def _part(file: Container) -> tuple[str, int] | None:
-    """Return the series of files and the place in it that the recorder has noted, None if it has not split any."""
+    """Return the series of files and the place in it that the recorder has noted; None if there is no series."""
     for record in file.metadata:
         series, found, part = record.metadata.get(SPLIT, "").rpartition(" ")
         if record.name == "reem" and found and part.isdecimal():

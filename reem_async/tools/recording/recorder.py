@@ -476,7 +476,7 @@ class Recorder:
                 self._keyframe_of_all()
 
     def _begin_next_file(self) -> None:
-        """Have the writer go on in another file if this one is as large or old as files are to be."""
+        """Begin the next file if this one has the size or age at which files are split."""
         writer = self.writer_thread
         if self._split is None or isinstance(writer, BlackBox) or writer.splitting:
             return

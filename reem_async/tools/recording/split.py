@@ -34,7 +34,7 @@ class Split:
         self._most_bytes = amount if is_size else float("inf")
         self._most_seconds = float("inf") if is_size else amount
         self._path = path
-        self._series = uuid.uuid4().hex  # tells that files belong together
+        self._series = uuid.uuid4().hex  # the same in all files of this recording
         self._begun = time.monotonic()
         self.files: list[FilePath] = []
 
@@ -47,8 +47,8 @@ class Split:
         return path, f"{self._series} {number}"
 
     def is_due(self, size: int) -> bool:
-        """Return whether a file of so many bytes is to be the last one no longer."""
-        # What a file begins with may alone be as large as a file is to be.
+        """Return whether the next file is to begin: this one has `size` bytes."""
+        # The state that a file begins with may alone have the size at which files are split.
         seconds = time.monotonic() - self._begun
         return seconds >= _LEAST_SECONDS and (size >= self._most_bytes or seconds >= self._most_seconds)
 

@@ -58,7 +58,7 @@ LARGE = (Role.UPDATE, Role.DELETE, Role.STATE, Role.STORED)
 _HURRY = 1 << 20
 """Bytes in the queue from which the thread is woken at once."""
 _MOST_MOVED = 100_000
-"""Values of former files of which it is known what stands for them now."""
+"""References to values of earlier files for which the reference in this file is kept."""
 
 _NUMPY = NumpyShip()
 
@@ -145,7 +145,7 @@ class WriterThread:
         self._full = False  # there is no channel any more, which was said
         self._following = following
         self._split_at = 0  # the log time of the states that the next file begins with
-        self._begun_at = 0  # and this one
+        self._begun_at = 0  # of those that this file begins with
         self._finished_bytes = 0  # of files that are complete
         # Since the last split: from when on news of each key are in this file, and what stands for older values here.
         self._since: dict[str, int] = {}
@@ -171,7 +171,7 @@ class WriterThread:
         return self._sink.output.tell()
 
     def split(self, now: int, waiting: Mapping[str, int]) -> None:
-        """Go on in another file, given the log time, and that of the first news of each key that has some waiting.
+        """Begin the next file, given the log time, and that of the first waiting update of each key that has some.
 
         The file begins with a state before all news that will be in it. It may be earlier than the last ones in the
         file before, by the time for which news wait.
@@ -448,7 +448,7 @@ class WriterThread:
         give_way()
 
     def _current(self, leaf: Any) -> Any:
-        """Return what stands for a value in this file, given what did when it was read."""
+        """Return a reference to the copy of a value in this file; it may name the copy in an earlier file."""
         if type(leaf) is not Reference or leaf.at == self._begun_at:
             return leaf
         if leaf.at > self._since.get(str(leaf.path[0]), -1):
