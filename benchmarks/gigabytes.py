@@ -10,8 +10,8 @@
 
 import argparse
 import contextlib
+import json
 import math
-import os
 import pathlib
 import random
 import resource
@@ -19,7 +19,9 @@ import shutil
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -227,23 +229,50 @@ def _children(process: int) -> Iterator[int]:
             yield from _children(child)
 
 
+_VISIT = """(async () => {
+  const go = %s, seek = %s, paths = %s;
+  window.actions = 0;
+  for (;; ++actions) {
+    if (actions %% 5) seek(Math.random());
+    else go(actions %% 10 ? "/" : `/view/${paths[(actions / 10) %% paths.length]}`);
+    await new Promise(done => setTimeout(done, 2500));
+  }
+})()"""
+
+
 def hour(file: pathlib.Path, minutes: int) -> None:
-    """Print the memory of the program and of Chromium each minute, with an action each 2.5 s."""
-    rng, number = random.Random(2), 0
-    with _shown(file) as (done, program):
+    """Print the memory of the program and of Chromium each minute, with an action each 2.5 s.
+
+    The page acts by itself: a browser that Playwright drives keeps the answers to all requests.
+    """
+    from websockets.sync.client import connect
+
+    with _served(file) as (address, program), tempfile.TemporaryDirectory() as profile:
+        command = ["chromium", "--headless", "--no-sandbox", "--remote-debugging-port=0", f"--user-data-dir={profile}"]
+        browser = subprocess.Popen([*command, "--window-size=1200,800", address], stderr=subprocess.DEVNULL)
+        time.sleep(10)
+        port = (pathlib.Path(profile) / "DevToolsActivePort").read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+            shown = next(each for each in json.load(answer) if each["url"].startswith(address))
+
+        def evaluated(script: str) -> Any:
+            """Return what a script gives in the page."""
+            with connect(shown["webSocketDebuggerUrl"]) as page:
+                page.send(json.dumps({"id": 1, "method": "Runtime.evaluate", "params": {"expression": script}}))
+                return json.loads(page.recv())["result"]["result"].get("value")
+
+        evaluated(_VISIT % (_GO, _SEEK, json.dumps(PLOTTED)))
         for minute in range(1, minutes + 1):
-            for _ in range(24):
-                _act(done, number, rng)
-                number += 1
-                done.page.wait_for_timeout(2500)
-            nodes = done.page.evaluate("() => document.querySelectorAll('*').length")
-            browser = sum(_memory(each) for each in _children(os.getpid()) if each != program.pid)
-            took = sorted(each for what in ("slider", "another view") for each in done.took[what][-24:])
+            time.sleep(60)
+            each = [_memory(child) for child in _children(browser.pid)]
+            done, nodes = evaluated("actions"), evaluated("document.querySelectorAll('*').length")
             print(
-                f"minute {minute}: {number} actions, the program {_memory(program.pid):.0f} MB, the browser "
-                f"{browser:.0f} MB, {nodes} elements, an action {statistics.median(took):.2f} s",
+                f"minute {minute}: {done} actions, the program {_memory(program.pid):.0f} MB, the page's process "
+                f"{max(each):.0f} MB, all of the browser {sum(each):.0f} MB, {nodes} elements",
                 flush=True,
             )
+        browser.terminate()
+        browser.wait()
 
 
 def main() -> None:

@@ -71,13 +71,8 @@ function indexAt(times, at) {
   return low - 1;
 }
 
-const dark = matchMedia("(prefers-color-scheme: dark)");
-
-// The list of listeners must not keep plots of views that are closed.
-function redrawWithTheme(plot) {
-  const kept = new WeakRef(plot), redraw = () => { if (kept.deref()) kept.deref().draw(); else dark.removeEventListener("change", redraw); };
-  dark.addEventListener("change", redraw);
-}
+// One listener for all: a listener of each plot would outlive the view that shows it.
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => document.querySelectorAll("canvas").forEach((canvas) => canvas.plot?.draw()));
 
 export class Plot {
   // options: axis, the TimeAxis of all plots over time; onPick, called with the x that was clicked; small, it is in a
@@ -100,7 +95,7 @@ export class Plot {
     this.selection = null; // what is being dragged over, to zoom in on it
     [this.left, this.bottom] = [NARROW, BOTTOM]; // px, of which the axes take
     new ResizeObserver(() => this.draw()).observe(this.canvas);
-    redrawWithTheme(this);
+    this.canvas.plot = this;
     this.gestures = new Gestures(this);
   }
 
