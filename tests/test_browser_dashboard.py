@@ -406,8 +406,10 @@ def test_the_first_page_shows_what_is_pinned_and_busy_keys_but_no_clocks_and_cou
 
 @pytest.mark.long
 def test_a_layout_is_saved_by_a_name_and_an_address_leads_to_it(visit, pspace, kvs, key):
-    pspace[key()] = {"y": 5.0, 'an "odd" [key]': {"z": 1.5}}
+    pspace[key()] = {"y": 5.0, "list": [1, 2], 'an "odd" [key]': {"z": 1.5}}
     name = key()
+    far = visit.open(f"/view/{name}.list[{2**63 - 1}]")  # of an address, too, which others have written
+    expect(row(far, f"{name}.list[1]")).to_be_visible()
     page = visit.open(f"/view/{name}.y")
     page.get_by_role("button", name="Pin", exact=True).click()
     page.get_by_role("button", name="Logarithmic axis").click()
@@ -423,12 +425,16 @@ def test_a_layout_is_saved_by_a_name_and_an_address_leads_to_it(visit, pspace, k
     assert kvs["_layouts"][name].read() == expected
     kvs["_layouts"]["hostile"].write({"pins": {"x": 1}, "plots": [1], "overlays": 3, "busiest": "x"})
     kvs["_layouts"]["array"].write({"pins": np.zeros(3)})
+    kvs["_layouts"]["large"].write({"pins": ["x" * 40_000]})
 
     other = visit.open(f"/?layout={name}")
     expect(other.locator(".pane .pane-head a")).to_have_text([f"{name}.y"])
     expect(other.get_by_role("button", name="Logarithmic axis")).to_have_attribute("aria-pressed", "true")
     other.locator(".pin").click()
     expect(other.get_by_label("Layout", exact=True).locator("option:checked")).to_have_text(f"{name} (changed)")
+    expect(other.get_by_label("Layout", exact=True).locator("option")).to_have_text(
+        ["own", f"{name} (changed)", "hostile"]
+    )
     other.get_by_label("Layout", exact=True).select_option("saved hostile")
     expect(other.locator(".pane")).to_have_count(0)
     other.get_by_label("Layout", exact=True).select_option("own")

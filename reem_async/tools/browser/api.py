@@ -292,7 +292,7 @@ class Api:
         except (MissingKey, NotKept, BadData, errors.NotAllowed):
             found = {}
         items = list(found.items())[:_MOST_LAYOUTS] if isinstance(found, dict) else []
-        layouts = {name: it for name, it in items if isinstance(it, dict) and _is_plain(it)}
+        layouts = {name: it for name, it in items if _is_layout(it)}
         # Not by orjson: programs may have stored half of a surrogate pair.
         return Response(json.dumps({"layouts": layouts}), media_type="application/json")
 
@@ -303,7 +303,7 @@ class Api:
         name, layout, _ = await self._content(request)
         if _LAYOUT_NAME.fullmatch(name) is None:
             raise RefusedRequest(400, f"{name[:60]!r} names no layout; use up to 60 letters, digits, blanks, - and _")
-        if layout is not None and (not isinstance(layout, dict) or len(json.dumps(layout)) > _LARGEST_LAYOUT):
+        if layout is not None and not _is_layout(layout):
             raise RefusedRequest(400, f"a layout is an object of up to {_LARGEST_LAYOUT} bytes")
         await self._source.save_layout(name, layout)
         return reply({"saved": name})
@@ -358,6 +358,10 @@ def _control(it: StoredParameter) -> dict[str, Any]:
 
 def _is_plain(value: Any) -> bool:
     return not any(isinstance(it, (Unfetched, *CONTENTS)) for _, it in walk(value, ()))
+
+
+def _is_layout(value: Any) -> bool:
+    return isinstance(value, dict) and _is_plain(value) and len(json.dumps(value)) <= _LARGEST_LAYOUT
 
 
 def _value_text(value: Any) -> str:

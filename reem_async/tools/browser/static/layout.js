@@ -117,8 +117,8 @@ export class LayoutBar {
         if (Object.hasOwn(layouts, name)) layout.show(layouts[name], name);
         else toast(`No layout “${name}” is in the store`);
       }
-    } catch {
-      toast("The layout in this address is damaged");
+    } catch (error) {
+      toast(error.status === undefined ? "The layout in this address is damaged" : error.message);
     }
   }
 
