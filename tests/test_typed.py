@@ -569,6 +569,33 @@ def test_a_class_that_forbids_other_fields_does(kind):
         made(kind, {"a": 1, "b": 2}, ("k",))
 
 
+@dataclasses.dataclass
+class Sequence:
+    child: "Sequence | Fallback | None"
+    kind: typing.Literal["sequence"] = "sequence"
+
+
+@dataclasses.dataclass
+class Fallback:
+    child: "Sequence | Fallback | None"
+    kind: typing.Literal["fallback"] = "fallback"
+
+
+def test_unions_in_unions_take_no_time_to_read():
+    """Each level has two choices: trying all of them again at each level would take 2**60 conversions."""
+    tree = None
+    for _ in range(60):
+        tree = Fallback(tree)
+    document = stored(Sequence | Fallback, tree, ("k",))
+    assert made(Sequence | Fallback, document, ("k",)) == tree
+    inner = document
+    while inner["child"] is not None:
+        inner = inner["child"]
+    inner["child"] = 1
+    with pytest.raises(reem.BadData, match=r"child.child: expected .*Sequence \| .*Fallback \| None, found 1"):
+        made(Sequence | Fallback, document, ("k",))
+
+
 def in_a_function():
     @dataclasses.dataclass
     class Local:

@@ -79,15 +79,18 @@ class Mismatch(Exception):
         return f"{show(path)}: expected {expected}, found {what} ({type(found).__name__})"
 
 
+def _no_ship(_: Any) -> None:
+    return None
+
+
 class _Way(NamedTuple):
     reads: bool
-    carries: Callable[[Any], Any]  # returns the ship that stores an object as it is, or None
+    carries: Callable[[Any], Any] = _no_ship  # returns the ship that stores an object as it is, or None
+    # What dicts and lists are as choices of unions, by their ids: unions in unions would be tried again and again.
+    tried: dict[tuple[int, int], tuple[Any, Any, Any]] | None = None
 
 
-_READ = _Way(True, lambda _: None)
-
-
-def stored(annotation: Any, value: Any, path: Path, carries: Callable[[Any], Any] = _READ.carries) -> Any:
+def stored(annotation: Any, value: Any, path: Path, carries: Callable[[Any], Any] = _no_ship) -> Any:
     """Return what to store of an object; what a ship carries stays as it is.
 
     Raises BadValue, which names path, expected and found, BadType or TooDeep.
@@ -108,7 +111,7 @@ def made(annotation: Any, value: Any, path: Path) -> Any:
         BadType: The annotation cannot be used.
     """
     try:
-        return _convert(annotation, value, path, _READ)
+        return _convert(annotation, value, path, _Way(True, tried={}))
     except Mismatch as error:
         raise BadData(str(error)) from None
 
@@ -277,7 +280,7 @@ def _convert(annotation: Any, value: Any, path: Path, way: _Way) -> Any:
     if is_object and (way.reads or way.carries(value) is not None):
         return value
     if (fields := fields_of(annotation)) is not None:
-        return _object(annotation, fields, value, path) if way.reads else _dict(annotation, fields, value, path, way)
+        return (_object if way.reads else _dict)(annotation, fields, value, path, way)
     if _is(kind, enum.Enum):
         return _member(kind, value, path, way)
     if kind in _SCALARS:
@@ -342,7 +345,7 @@ def _one_of(union: Any, value: Any, path: Path, way: _Way) -> Any:
     choices = get_args(union)
     chosen, result = _chosen(choices, value, path, way, _name(union))
     if not way.reads and len(choices) - (type(None) in choices) > 1:
-        read, _ = _chosen(choices, result, path, _READ, _name(union))
+        read, _ = _chosen(choices, result, path, _Way(True, tried={}), _name(union))
         if read is not chosen:
             raise BadType(
                 f"{show(path)}: in {_name(union)} this {_name(chosen)} would be read as {_name(read)}, since what is "
@@ -355,11 +358,26 @@ def _chosen(choices: tuple[Any, ...], value: Any, path: Path, way: _Way, name: s
     deepest: Mismatch | None = None
     for choice in sorted(choices, key=lambda choice: _distance(choice, value)):
         try:
-            return choice, _convert(choice, value, path, way)
+            return choice, _as_choice(choice, value, path, way)
         except Mismatch as error:
             if len(error.args[0]) > len(deepest.args[0] if deepest else path):
                 deepest = error
     raise deepest or Mismatch(path, name, value)
+
+
+def _as_choice(choice: Any, value: Any, path: Path, way: _Way) -> Any:
+    if way.tried is None or not isinstance(value, dict | list):
+        return _convert(choice, value, path, way)
+    place = id(value), id(choice)
+    if place not in way.tried:
+        try:
+            found = _convert(choice, value, path, way)
+        except Mismatch as error:
+            found = error
+        way.tried[place] = found, value, choice  # kept, so that no others get their ids
+    if isinstance(found := way.tried[place][0], Mismatch):
+        raise found
+    return found
 
 
 def _distance(choice: Any, value: Any) -> float:
@@ -371,12 +389,12 @@ def _distance(choice: Any, value: Any) -> float:
     return len(fields.keys() ^ value.keys()) if fields is not None and isinstance(value, Mapping) else 0
 
 
-def _object(annotation: Any, fields: dict[str, Field], value: Any, path: Path) -> Any:
+def _object(annotation: Any, fields: dict[str, Field], value: Any, path: Path, way: _Way) -> Any:
     _checked(value, Mapping, path)
     found: dict[Use, dict[str, Any]] = {use: {} for use in Use}
     for name, field in fields.items():
         if name in value:
-            found[field.use][name] = _convert(field.annotation, value[name], (*path, name), _READ)
+            found[field.use][name] = _convert(field.annotation, value[name], (*path, name), way)
         elif field.required:
             raise Mismatch((*path, name), _name(field.annotation), _NONE)
     unknown = {name: each for name, each in value.items() if name not in fields}
