@@ -196,26 +196,32 @@ class Arrays:
         )
 
     async def image(self, request: Request) -> Response:
-        """Return a part of an array as PNG; what is said of it is in the header X-Picture."""
+        """Return a part of an array as PNG, and what is said of it in the header X-Picture.
+
+        `coarse` is for panes: without statistics, and JPEG for colours that are averaged in any case.
+        """
         sample = await self._sample(request)
         array = sample.value
         chosen = _slice(request, array, 3)
         low, high = number_of(request, "low"), number_of(request, "high")
         side = integer_of(request, "side", 1024, LARGEST_SIDE)
         colours, bgr = request.query_params.get("map", "grey"), request.query_params.get("bgr") == "1"
+        coarse = request.query_params.get("coarse") == "1"
 
         # A preview has its range with it; its statistics would be those of a small picture.
         def work() -> tuple[RenderedPicture, dict[str, Any]]:
             if isinstance(array, Preview):
                 return array.paint(colours, low, high, side=side, bgr=bgr), {}
-            return paint(part(array, chosen), colours, low, high, side=side, bgr=bgr), statistics(array)
+            picture = paint(part(array, chosen), colours, low, high, side=side, bgr=bgr, coarse=coarse)
+            return picture, {} if coarse else statistics(array)
 
         if isinstance(array, Preview) and chosen != array.chosen:
             raise NotKept(f"only a small picture of [{_text(array.chosen)}] is kept for this instant")
         picture, said = await self._do(1 << 20 if isinstance(array, Preview) else array.nbytes, work)
         told = {"low": picture.low, "high": picture.high, "bad": picture.bad, "size": picture.size}
         told |= {"statistics": said, "preview": isinstance(array, Preview), **_when(sample)}
-        return Response(picture.png, headers={"x-picture": orjson.dumps(told).decode()}, media_type="image/png")
+        kind = next(kind for magic, kind in _MAGIC if picture.png.startswith(magic))
+        return Response(picture.png, headers={"x-picture": orjson.dumps(told).decode()}, media_type=kind)
 
     async def colours(self, request: Request) -> Response:
         return reply(colours_of(request.query_params.get("map", "grey")))

@@ -77,7 +77,7 @@ class Pane {
       this.body.append(this.overlay.wrong);
     }
     const { app } = this.grid, map = ["uint8", "bool"].includes(this.about.dtype) ? "grey" : "viridis";
-    const { blob, said } = await getPicture("image", { path: this.address, at: app.at, slice: this.about.views.image, map, side: 480 }, signal);
+    const { blob, said } = await getPicture("image", { path: this.address, at: app.at, slice: this.about.views.image, map, side: 480, coarse: 1 }, signal);
     await swap(this.picture, blob);
     await this.overlay.update(said.size, signal);
     setText(this.age, said.age > 0.5 ? `from ${said.age.toFixed(1)} s before` : "");
