@@ -271,9 +271,10 @@ class WrongKind(ReemError, redis.exceptions.ResponseError):
         where: The path that was meant.
     """
 
-    def __init__(self, key: str, where: str, kind: str = "another type", *, text: bool = False) -> None:
+    def __init__(self, key: str, where: str, kind: str = "", *, text: bool = False) -> None:
+        what = f"type {kind}" if kind else "another type"
         foreign = (
-            f"the Redis key {key!r} holds a value of type {kind} (a program without REEM wrote it), not a document; "
+            f"the Redis key {key!r} holds a value of {what} (a program without REEM wrote it), not a document; "
             f"kvs.raw[{key!r}] reads it"
         )
         moved = (

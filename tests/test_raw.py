@@ -189,6 +189,19 @@ def test_all_keys_of_a_pattern_are_told_first_and_then_what_changes(watching, fr
     assert watch.told() == ("stored", key("a2"), None, True)
 
 
+def test_a_document_that_another_program_replaces_is_reported(watching, front, kvs, raw, key, monkeypatch):
+    """Also at once, while the watch takes the key for one of REEM's."""
+    monkeypatch.setattr(raw_watch, "_DOCUMENT_SECONDS", 0.5)
+    raw.set(key("a"), "1")
+    watch = watching(front.kvs.raw.watch(key("*"), policy=Last(100)))
+    assert watch.next().value == 1
+    kvs[key("b")] = {"n": 1}
+    raw.set(key("a"), "2")
+    assert watch.told() == ("stored", key("a"), 2, False)
+    raw.set(key("b"), "[7]")
+    assert watch.told() == ("stored", key("b"), [7], False)
+
+
 def test_one_key_is_watched_and_the_last_value_always_arrives(watching, front, raw, key):
     raw.set(key("q"), "0")
     watch = watching(front.kvs.raw[key("q")].watch())

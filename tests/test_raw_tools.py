@@ -18,7 +18,7 @@ from conftest import PATIENCE, ROOT, assert_same, eventually, url_of_user
 
 import reem
 from reem.errors import BadValue
-from reem_async import RedisInterface
+from reem_async import KeyValueStore, RedisInterface
 from reem_async.recording import Recorder, open_log
 from reem_async.tools.browser.raw import hint_of, numbers_of
 from reem_async.tools.cli import raw as cli_raw
@@ -211,6 +211,28 @@ async def test_they_are_recorded_with_their_types_and_times(lab, file):
         assert_same(last["mine"], {"image": IMAGE, "n": 1})
         assert log["camera::rgb"].at(log.end)[8:] == IMAGE.tobytes()
         assert_same(next(log["sai::q"].values())[1], [0.1, 0.2])
+
+
+async def test_a_document_that_another_program_replaces_is_recorded_as_what_it_is_then(server, file):
+    async with RedisInterface(server) as interface:
+        mine = KeyValueStore(interface)["mine"]
+        await mine.write({"n": 1})
+        with redis.Redis.from_url(server.url) as robot:
+            robot.set("other", "0")
+            async with Recorder(interface, path=file) as recorder:
+                for number in range(3):
+                    await mine.write({"n": number, "image": IMAGE})
+                    await asyncio.sleep(0.2)
+                    robot.delete("mine")
+                    robot.set("mine", f"[{number}]")
+                    await asyncio.sleep(0.3)
+                    robot.delete("mine")
+                robot.hset("mine", "volts", "24.5")
+            assert (recorder.status.lost, recorder.status.dropped) == (0, 0)
+    with open_log(file) as log:
+        assert log["mine"].at(log.end) == {"volts": 24.5}
+        values = [repr(it.value) for it in log.updates(patterns=["mine"])]
+        assert all(f"[{number}]" in values for number in range(3)), values
 
 
 @pytest.fixture(scope="module")

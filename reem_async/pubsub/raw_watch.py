@@ -128,6 +128,11 @@ class RawWatch(Stream[RawUpdate]):
         if self._follower is not None:
             self._follower.rate = rate
 
+    def look(self, name: str) -> None:
+        """Have a key read that has no document of REEM any more."""
+        if self._follower is not None:
+            self._follower.look(name)
+
     async def caught_up(self, seconds: float) -> None:
         """Return when what was changed before now is read and taken, or so many seconds are over."""
         follower = self._follower
@@ -221,6 +226,7 @@ class _Follower:
         # Keys that were there when they were last read, and whether each was a short string
         self._known: dict[str, bool] = {}
         self._documents: dict[str, float] = {}  # keys with documents of REEM, and when that was found
+        self._doubtful: set[str] = set()  # of these, keys that were changed since: another program may have them now
         self._next_look = 0.0
         self._is_first = True
         self.turns = 0  # how often keys were read
@@ -321,14 +327,23 @@ class _Follower:
         if message[1] is None:  # all keys were removed
             self._mark(list(self._known))
             return
+        names = [name for data in message[1] if (name := raw_name(data)) is not None and self._meant(name)]
         since = time.monotonic() - _DOCUMENT_SECONDS
-        self._mark(
-            name
-            for data in message[1]
-            if (name := raw_name(data)) is not None
-            and self._meant(name)
-            and self._documents.get(name, -math.inf) < since
-        )
+        documents = {name for name in names if self._documents.get(name, -math.inf) >= since}
+        self._doubtful |= documents
+        self._mark(name for name in names if name not in documents)
+
+    def _look_at_doubtful(self) -> None:
+        """Have keys read that were changed while they were taken to hold documents, once they are not any more."""
+        since = time.monotonic() - _DOCUMENT_SECONDS
+        names = [name for name in self._doubtful if self._documents.get(name, -math.inf) < since]
+        self._doubtful.difference_update(names)
+        self._mark(names)
+
+    def look(self, name: str) -> None:
+        """Have a key read now that was taken to hold a document."""
+        if self._documents.pop(name, None) is not None:
+            self._mark([name])
 
     def _meant(self, name: str) -> bool:
         if self._name is not None:
@@ -353,6 +368,7 @@ class _Follower:
         if loop.time() >= self._next_look:
             self._next_look = loop.time() + _PERIOD
             await self.connect()
+            self._look_at_doubtful()
         now = loop.time()
         # Keys that were changed do not wait for those that a search has found, of which there may be thousands.
         changed = self._due(_AT_ONCE, is_changed=True)

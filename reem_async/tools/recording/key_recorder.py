@@ -202,6 +202,8 @@ class Collector(Protocol):
 
     def look_for_losses(self) -> None: ...
 
+    def record_raw(self, name: str) -> bool: ...
+
     def failed(self, error: Exception) -> None: ...
 
 
@@ -381,6 +383,12 @@ class KeyRecorder:
 
     def _give_up(self, head: Item, error: Exception) -> None:
         """Leave out what cannot be fetched; the key is read again later: soon, or at a keyframe if it is no value."""
+        if head.is_whole and isinstance(error, WrongKind) and self._collector.record_raw(self._name):
+            gone = self._queue.give_up()
+            if not self.absent:
+                gone.value = MISSING
+                self._emit(gone)
+            return
         if self._complaint != str(error):
             logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
         self._complaint = str(error)

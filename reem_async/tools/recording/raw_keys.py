@@ -70,6 +70,12 @@ class RawRecorder:
         if self._is_on:
             await self._watch.caught_up(seconds)
 
+    def look(self, name: str) -> bool:
+        """Have a key recorded that has no document of REEM any more; return whether such keys are recorded."""
+        if self._is_on:
+            self._watch.look(name)
+        return self._is_on
+
     async def stop(self) -> None:
         await self._watch.close()
 

@@ -437,6 +437,10 @@ class Recorder:
     def hears_of_changes(self) -> bool:
         return manager_of(self.session).hears_of_changes
 
+    def record_raw(self, name: str) -> bool:
+        """Record a key as another program's from now on; return whether such keys are recorded."""
+        return self._raw.look(name)
+
     def failed(self, error: Exception) -> None:
         self._failure = error
         self._done.set()
