@@ -226,7 +226,7 @@ def _print(log: Log, channels: list[ChannelSummary]) -> None:
     # Channels of REEM itself (/_reem/...) say which top-level key they are about.
     rows = [
         (
-            clean(each.topic),
+            clean(each.topic or '""'),
             clean(f"{each.role} {each.path}".strip() if each.topic.startswith("/_reem") else _role(each)),
             clean(each.schema),
             str(each.messages),
@@ -259,7 +259,8 @@ def _skipped(channels: list[ChannelSummary]) -> Iterator[str]:
     for reason in dict.fromkeys(each.skipped for each in channels if each.skipped):
         those = [each for each in channels if each.skipped == reason]
         messages = counted(sum(each.messages for each in those), "message")
-        yield f"{messages} of {named([each.topic for each in those])}: {reason}"
+        topics = [each.topic or '""' for each in those]
+        yield f"{messages} of {named(topics)}: {reason}"
 
 
 def _role(each: ChannelSummary) -> str:
