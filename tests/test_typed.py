@@ -694,6 +694,8 @@ def test_a_parameter_that_is_an_object_is_a_parameter_for_each_field(front, key,
     gains = front.wait(place.parameter("gains", Gains(), on_change=seen.append))
     assert gains.value.limits.joints.dtype == np.float32
     assert gains.value is not gains.value
+    with pytest.raises(ValueError, match="read-only"):
+        gains.value.limits.joints[0] = 9
     described = {
         each: front.wait(front.at(["_parameters", f"{name}.gains.{each}"]).read()) for each in ("mode", "number")
     }

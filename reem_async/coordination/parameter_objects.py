@@ -42,9 +42,10 @@ class ObjectDeclaration(NamedTuple):
             inner = tree
             for each in above:
                 inner = inner.setdefault(each, {})
-            dtype = self.dtypes.get(part.path)
-            value = as_json(values[part.path])
-            inner[name] = value if dtype is None else np.array(value, dtype)
+            inner[name] = value = as_json(values[part.path])
+            if (dtype := self.dtypes.get(part.path)) is not None:
+                inner[name] = array = np.array(value, dtype)
+                array.flags.writeable = False  # all objects that are made of this tree share it
         return tree
 
     async def begin(self, group: ParameterGroup) -> Live:

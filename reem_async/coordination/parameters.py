@@ -384,8 +384,8 @@ class Parameter(Handle, Generic[T]):
         """The value as of now, without a round trip: the last good one that was stored, or the default.
 
         Any thread may ask. A vector is a new list, or a read-only array if the default is an array. An object is a new
-        one: changing it changes nothing else. Raises Stale once the interface is closed, and in a forked child or
-        another event loop until it is declared there.
+        one, whose arrays are read-only: changing it changes nothing else. Raises Stale once the interface is closed,
+        and in a forked child or another event loop until it is declared there.
         """
         self._check()
         value: T = self._declaration.given(self._live.value)

@@ -15,6 +15,7 @@ import inspect
 import logging
 import math
 import pathlib
+import re
 import sys
 import types
 import uuid
@@ -408,7 +409,8 @@ def _constructed(annotation: Any, values: dict[str, Any], unknown: dict[str, Any
     try:
         return construct(annotation, values, unknown)
     except Exception as error:  # what the class itself checks
-        raise Mismatch(path, f"what {_name(annotation)} takes ({' '.join(str(error).split()):.200})", value) from error
+        text = re.sub(r"\s*For further information visit \S+", "", str(error))  # of pydantic
+        raise Mismatch(path, f"what {_name(annotation)} takes ({' '.join(text.split()):.200})", value) from error
 
 
 def _constrained(annotation: Any, note: Any, value: Any, path: Path) -> None:
