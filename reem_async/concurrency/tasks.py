@@ -107,15 +107,27 @@ def come_last() -> None:
 
     Niceness decides how much a thread gets. A thread that was woken waits up to a whole turn of any other, 1.4 ms by
     default, so the turns are short. Linux with autogroup=1 shares processors among sessions first, where niceness
-    counts for nothing: a process that leads its session, such as a service, also lowers the session.
+    counts for nothing: a process that is alone in its session, such as a service, also lowers the session.
     """
     with contextlib.suppress(AttributeError, OSError):
         os.nice(_NICEST)
     take_short_turns(inherited=True)
     with contextlib.suppress(AttributeError, OSError):
-        if os.getsid(0) == os.getpid():
+        if _is_alone_in_session():
             with open(_SESSION, "w", encoding="ascii") as file:
                 file.write(str(_NICEST))
+
+
+def _is_alone_in_session() -> bool:
+    others = {int(name) for name in os.listdir("/proc") if name.isdecimal()} - {os.getpid()}
+    return os.getsid(0) == os.getpid() and not any(_session_of(each) == os.getpid() for each in others)
+
+
+def _session_of(process: int) -> int:
+    try:
+        return os.getsid(process)
+    except ProcessLookupError:  # it has ended meanwhile
+        return 0
 
 
 def take_short_turns(*, inherited: bool = False) -> None:
