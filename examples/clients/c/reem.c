@@ -1,5 +1,4 @@
-// A client of REEM in C with plain sockets, for a server with the JSON module. It follows docs/wire.md.
-//   cc -O2 -o reem reem.c
+// A client of REEM in C with plain sockets, for a server with the JSON module, by docs/wire.md. cc -O2 -o reem reem.c
 //   ./reem redis://localhost:6379 get arm.q
 //   ./reem redis://localhost:6379 publish arm '{"speed":0.5}'
 //   ./reem redis://localhost:6379 watch arm.q 10
@@ -72,8 +71,7 @@ static void print_array(Text npy) {
     long items = -1, start = npy.size > 10 ? 10 + (unsigned char)npy.data[8] + 256 * (unsigned char)npy.data[9] : 0;
     int end = 0, is_npy = start && start <= npy.size && !memcmp(npy.data, "\x93NUMPY\1", 8);
     if (is_npy) sscanf(npy.data + 10, "{'descr': '<f8', 'fortran_order': False, 'shape': (%ld,), }%n", &items, &end);
-    int is_known = end && end + 10 < start && items >= 0 && (npy.size - start) / 8.0 == items;
-    check(is_known, "%s%s is not an array of float64 with one dimension", key, path);
+    check(end && 10 + end < start && items >= 0 && npy.size == start + 8.0 * items, "%s%s: not float64[n]", key, path);
     printf("{\"dtype\":\"<f8\",\"shape\":[%ld],\"data\":[", items);
     for (long at = 0; at < items; at++) {
         double item;
@@ -121,8 +119,10 @@ static void watch(const char *url, long lines) {
 // Replace a key by JSON and have its subscribers read it, in one transaction. RedisJSON reads 15 digits exactly.
 static void publish(const char *json) {
     char notice[200];
-    for (const char *digits = "0123456789.", *at = json; (at = strpbrk(at, digits)); at += strspn(at, digits)) {
-        check(strspn(at, digits) <= 16, "a number has over 15 digits: %.20s", at);
+    for (const char *digits = "0123456789.", *at = json; (at = strpbrk(at, digits));) {
+        size_t size = strspn(at, digits);
+        check(size <= 16 && at[size] != 'e' && at[size] != 'E', "over 15 digits, or an exponent: %.20s", at);
+        at += size;
     }
     check(!*path && !strpbrk(json, "'\r\n") && !strstr(json, "$ship "), "publish JSON without ' at a key such as arm");
     fprintf(out, "WATCH %s {%s}:ships {%s}:lease\r\nEXISTS {%s}:lease\r\n", key, key, key, key);

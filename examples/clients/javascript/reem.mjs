@@ -12,7 +12,7 @@ process.on("uncaughtException", (error) => {
   process.exit(1);
 });
 
-const [url, action, place, word = "null"] = process.argv.slice(2);
+const [url, action, place, word] = process.argv.slice(2);
 const [, host, port = 6379] = /^redis:\/\/([^:/@]+)(?::(\d+))?$/.exec(url) ?? [];
 const [, key, path] = /^([\w:]+)((?:\.\w+|\[\d+\])*)$/.exec(place) ?? [];
 check(host && key, "usage: node reem.mjs redis://HOST:PORT get|publish|watch|call PLACE [JSON | LINES]");
@@ -42,11 +42,9 @@ async function next() {
   if (kind === "_" || size === -1) return null;
   if (kind === "+" || kind === ":") return line.slice(1);
   check(line && "$*~>%".includes(kind) && size >= 0 && size < 2 ** 26, "the server sent what is not a reply");
-  if (kind === "$") {
-    const bytes = await receive(size);
-    check(bytes.length === size, "the server sent a text of another size than announced");
-    return bytes;
-  }
+  const bytes = kind === "$" && await receive(size);
+  check(!bytes || bytes.length === size, "the server sent a text of another size than it announced");
+  if (bytes) return bytes;
   while (items.length < (kind === "%" ? 2 * size : size)) items.push(await next());
   return Object.assign(items, { isMessage: kind === ">" });
 }
@@ -112,8 +110,9 @@ async function watch(lines) {
 
 // Replace a key by JSON and have its subscribers read it, in one transaction. RedisJSON reads 15 digits exactly.
 async function publish(json) {
-  const now = Date.now() / 1000, notice = `${JSON.stringify([1, id, 1, now, [], "look", 0, []])}\n`;
-  check(!/[\d.]{17}|"\$ship /.test(json), "a number has over 15 digits, or a text begins with $ship");
+  const notice = `${JSON.stringify([1, id, 1, Date.now() / 1000, [], "look", 0, []])}\n`;
+  const isExact = !/[\d.]{17}|\d[eE]/.test(json);
+  check(isExact && !json.includes('"$ship '), "over 15 digits, an exponent, or a text that begins with $ship");
   await ask(["WATCH", key, `${tag}:ships`, `${tag}:lease`], ["JSON.TYPE", key]); // refused for a key of another program
   check(await ask(["EXISTS", `${tag}:lease`]) === "0", `${key} is owned by another program`);
   check(await ask(["EXISTS", `${tag}:ships`]) === "0", `${key} has arrays, which this client would leave behind`);
@@ -125,29 +124,27 @@ async function publish(json) {
 // Send arguments to one program that serves, and return its answer. Both sides give up after ten seconds.
 async function call(json) {
   await subscribe(`answers@${id}`);
-  const name = `${tag}${path}:serve@`.replace(/[[\]]/g, "\\$&"); // special in patterns
-  const [channel] = await ask(["PUBSUB", "CHANNELS", name + "?".repeat(16)]);
+  const [channel] = await ask(["PUBSUB", "CHANNELS", `${tag}${path}:serve@${"?".repeat(16)}`]);
   check(channel !== undefined, `no program serves ${place}`);
   const head = [1, "call", id, id, 10, ["", ""], "here", Buffer.byteLength(json), []];
   const reached = await ask(["PUBLISH", channel, `${JSON.stringify(head)}\n${json}`]);
   check(reached !== "0", `the program that served ${place} has just ended: call again`);
-  for (const end = Date.now() + 10_000; Date.now() < end; ) {
-    const payload = (await message())?.[2];
-    if (payload === undefined) continue;
-    const line = String(payload).split("\n", 1)[0], answer = payload.subarray(Buffer.byteLength(line) + 1);
-    const [version, kind, number, server, , texts, where, size] = JSON.parse(line);
-    check(version === 1 && number === id && server === String(channel).slice(-16), "an answer to something else");
-    check(kind === "answer", `${kind}: ${JSON.stringify(texts)}`);
-    check(where === "here" && size === answer.length, "the answer has arrays, or over 64 kB");
-    return shown(String(answer), null);
-  }
-  throw new Error("no answer in 10 s; the call may or may not have been handled");
+  let payload;
+  for (const end = Date.now() + 10_000; !payload && Date.now() < end; ) payload = (await message())?.[2];
+  check(payload, "no answer in 10 s; the call may or may not have been handled");
+  const line = String(payload).split("\n", 1)[0], answer = payload.subarray(Buffer.byteLength(line) + 1);
+  const [version, kind, number, server, , texts, where, size] = JSON.parse(line);
+  check(version === 1 && number === id && server === String(channel).slice(-16), "an answer to something else");
+  check(kind === "answer", `${kind}: ${JSON.stringify(texts)}`);
+  check(where === "here" && size === answer.length, "the answer has arrays, or over 64 kB");
+  return shown(String(answer), null);
 }
 
+if (action === "publish" || action === "call") JSON.parse(word); // an error if it is none
 await ask(["HELLO", "3"]);
 if (action === "get") console.log((await read())[0] || check(false, `nothing is stored at ${place}`));
-else if (action === "publish" && !path) await publish(JSON.stringify(JSON.parse(word)));
+else if (action === "publish" && !path) await publish(word);
 else if (action === "watch") await watch(Number(word) || Infinity);
-else if (action === "call") console.log(await call(JSON.stringify(JSON.parse(word))));
-else check(false, `${action} is none of get, publish, watch and call`);
+else if (action === "call") console.log(await call(word));
+else check(false, `cannot ${action} ${place}`);
 process.exit(0);

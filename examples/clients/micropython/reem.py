@@ -20,11 +20,10 @@ def check(ok, why):
         raise ValueError(why)
 
 
-def connect(seconds):
-    """Return a connection to the server. It waits so long for an answer."""
+def connect():
     host, _, port = url.replace("redis://", "").partition(":")
     found = socket.socket()
-    found.settimeout(seconds)
+    found.settimeout(5)
     found.connect(socket.getaddrinfo(host, int(port or 6379), 0, socket.SOCK_STREAM)[0][-1])
     return found
 
@@ -33,15 +32,14 @@ def next_lines(stream, kinds):
     """Read lines of these kinds (: a number, $ and * how many bytes or items follow) and return the last number."""
     line = b":0"
     for kind in kinds:
-        line = stream.readline(4096)
-        check(line[-2:] == b"\r\n", "the server closed the connection")
+        line = stream.readline(4096) or b""
+        check(line[-2:] == b"\r\n", "the server closed the connection, or does not answer")
         check(line[:1] != b"-", "the server refused: " + line[1:].decode())
         check(line[:1] == kind.encode(), "the server sent another reply than expected")
     return int(line[1:]) if line[:1] in b":$*" else 0
 
 
 def next_text(stream):
-    """Read bytes, or None if there is nothing."""
     size = next_lines(stream, "$")
     if size == -1:
         return None
@@ -52,7 +50,6 @@ def next_text(stream):
 
 
 def ask(kinds, *commands):
-    """Send commands, and read the lines of their replies."""
     for words in commands:
         words = [word.encode() for word in words]
         sized = [b"$%d\r\n%s\r\n" % (len(word), word) for word in words]
@@ -61,12 +58,17 @@ def ask(kinds, *commands):
 
 
 def subscribe(channel):
-    """Return a connection for messages, and what they are read from."""
-    connection = connect(10)
+    connection = connect()
     connection.sendall(("SUBSCRIBE %s%s\r\n" % (tag, channel)).encode())
     stream = connection.makefile("rb")
     next_lines(stream, "*$s${:")  # a list of the word subscribe, the channel, and a number
     return connection, stream
+
+
+def arrives(connection, seconds):
+    poll = select.poll()
+    poll.register(connection, select.POLLIN)
+    return poll.poll(1000 * seconds)
 
 
 def shown(text, npy):
@@ -75,11 +77,9 @@ def shown(text, npy):
         check('"$ship ' not in text, place + " has more than JSON: get one array, such as arm.q")
         return text
     items = len(npy) // 8 - 16
-    header = "{'descr': '<f8', 'fortran_order': False, 'shape': (%d,), }" % items
-    check(
-        npy[:128] == b"\x93NUMPY\x01\x00v\x00%-117s\n" % header.encode(),
-        place + " is not an array of float64 with one dimension",
-    )
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (%d,), }" % items
+    is_known = len(npy) % 8 == 0 and npy[:128] == b"\x93NUMPY\x01\x00v\x00%-117s\n" % header
+    check(is_known, place + " is not an array of float64 with one dimension")
     return json.dumps({"dtype": "<f8", "shape": [items], "data": list(struct.unpack("<%dd" % items, npy[128:]))})
 
 
@@ -96,25 +96,24 @@ def read():
 def watch(lines):
     """Print the value, and again after each change. A notice is a reason to read, and each second is one."""
     notices, _ = subscribe(":notices")
-    poll, last, known = select.poll(), None, None
-    poll.register(notices, select.POLLIN)
+    last, known = None, None
     while lines != 0:
         text, note = read()
         known = note or known  # a note expires
         if (text, known) != last:
-            last = text, known
             print('{"update":%s,"value":%s}' % (json.dumps(known), text or "null"))
+            last = text, known
             lines -= 1
-            continue
-        if poll.poll(1000):
+        elif arrives(notices, 1):
             check(notices.recv(4096), "the server closed the connection")
 
 
 def publish(text):
     """Replace a key by JSON and have its subscribers read it, in one transaction. RedisJSON reads 15 digits exactly."""
     check(not path, "publish a whole key, such as arm")
-    digits = "".join(["0" if it in "0123456789." else " " for it in text])
-    check("0" * 17 not in digits and '"$ship ' not in text, "a number has over 15 digits, or a text begins with $ship")
+    digits = "".join(["0" if it in "0123456789." else it.lower() for it in text])
+    check("0" * 17 not in digits and "0e" not in digits, "a number has over 15 digits or an exponent")
+    check('"$ship ' not in text, "a text begins with $ship")
     ask("+", ["WATCH", key, tag + ":ships", tag + ":lease"])
     check(ask(":", ["EXISTS", tag + ":lease"]) == 0, key + " is owned by another program")
     check(ask(":", ["EXISTS", tag + ":ships"]) == 0, key + " has arrays, which this client would leave behind")
@@ -129,13 +128,14 @@ def publish(text):
 
 def call(text):
     """Send arguments to one program that serves, and return its answer. Both sides give up after ten seconds."""
-    _, answers = subscribe(":answers@" + me)
+    connection, answers = subscribe(":answers@" + me)
     servers = ask("*", ["PUBSUB", "CHANNELS", tag + path + ":serve@" + "?" * 16])
     check(servers > 0, "no program serves " + place)
     channel = [next_text(replies) for _ in range(servers)][-1].decode()
     head = json.dumps([1, "call", me, me, 10, ["", ""], "here", len(text.encode()), []])
     reached = ask(":", ["PUBLISH", channel, head + "\n" + text])
     check(reached > 0, "the program that served %s has just ended: call again" % place)
+    check(arrives(connection, 10), "no answer in 10 s; the call may or may not have been handled")
     next_lines(answers, "*$m${")  # a list of the word message, the channel, and what was published
     line, _, answer = next_text(answers).partition(b"\n")
     version, kind, number, sender, _, texts, where, size, _ = json.loads(line)
@@ -146,14 +146,16 @@ def call(text):
 
 
 try:
-    check(len(sys.argv) > 3, "usage: reem.py redis://HOST:PORT get|publish|watch|call PLACE [JSON | LINES]")
-    url, action, place, word = (sys.argv + [""])[1:5]
+    url, action, place, word = (sys.argv + [""] * 4)[1:5]
+    check(
+        action in ("get", "publish", "watch", "call"), "usage: reem.py URL get|publish|watch|call PLACE [JSON | LINES]"
+    )
     key = place.replace("[", ".").split(".")[0]
     path, tag, me = place[len(key) :], "{%s}" % key, os.urandom(8).hex()
     is_plain = not [it for it in place if it not in "_.[]:" and not ("0" <= it <= "9" or "a" <= it.lower() <= "z")]
     check(key and is_plain and ".." not in path, place + " is not like arm.joints[0]")
     json.loads(word if action in ("publish", "call") else "0")
-    server = connect(5)
+    server = connect()
     replies = server.makefile("rb")
     if action == "publish":
         publish(word)
