@@ -28,8 +28,6 @@ from .source import Source
 from .timeline import PENDING, UNKNOWN
 from .trees import thawed
 
-_ALL = 1 << 40  # bytes that may wait for the disk: all of it is in memory already
-
 
 class Saving:
     """Answers with a file of all that the slider holds; one at a time."""
