@@ -116,8 +116,8 @@ async function publish(json) {
   await ask(["WATCH", key, `${tag}:ships`, `${tag}:lease`], ["JSON.TYPE", key]); // refused for a key of another program
   check(await ask(["EXISTS", `${tag}:lease`]) === "0", `${key} is owned by another program`);
   check(await ask(["EXISTS", `${tag}:ships`]) === "0", `${key} has arrays, which this client would leave behind`);
-  const last = ["SET", `${tag}:last`, `${id} 1`, "EX", "60"], told = ["PUBLISH", `${tag}:notices`, notice];
-  const replies = await ask(["MULTI"], ["JSON.SET", key, "$", json], last, told, ["EXEC"]);
+  const last = ["SET", `${tag}:last`, `${id} 1`, "EX", "60"], announced = ["PUBLISH", `${tag}:notices`, notice];
+  const replies = await ask(["MULTI"], ["JSON.SET", key, "$", json], last, announced, ["EXEC"]);
   check(replies !== null, `another client wrote ${key} at the same time: publish again`);
 }
 
