@@ -14,7 +14,7 @@ MAGENTA = (255, 0, 255)
 
 
 def pixels(picture):
-    with Image.open(io.BytesIO(picture.png)) as image:
+    with Image.open(io.BytesIO(picture.file)) as image:
         return np.asarray(image)
 
 
@@ -87,7 +87,7 @@ def test_what_is_no_picture_is_refused():
 def test_only_colours_of_a_smaller_picture_may_be_coarse():
     slope = np.stack([np.add.outer(np.arange(480), np.arange(640)) // 5] * 3, axis=2).astype(np.uint8)
     exact, coarse = paint(slope, side=480), paint(slope, side=480, coarse=True)
-    assert coarse.png.startswith(b"\xff\xd8\xff")
+    assert coarse.file.startswith(b"\xff\xd8\xff")
     assert np.abs(pixels(coarse).astype(int) - pixels(exact)).max() < 16
     for plane, side in ((slope, 640), (slope[:, :, 0], 480), (slope.astype("f4"), 480)):
         assert paint(plane, side=side, coarse=True) == paint(plane, side=side)

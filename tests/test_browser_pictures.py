@@ -183,7 +183,7 @@ def test_a_preview_looks_like_the_array(kind):
     small, whole = preview.paint("grey", None, None, side=100, bgr=False), paint(array, side=100)
     assert small.size == whole.size == (400, 300)
     assert (small.low, small.high, small.bad) == (whole.low, whole.high, whole.bad)
-    apart = np.abs(pixels(small.png).astype(int) - pixels(whole.png))
+    apart = np.abs(pixels(small.file).astype(int) - pixels(whole.file))
     assert np.percentile(apart, 90) <= 12
 
 

@@ -68,7 +68,7 @@ def picture_of(array: np.ndarray[Any, Any]) -> str | None:
         return None
     found = paint(array, side=_SIDE)
     return (
-        f'<img src="data:image/png;base64,{b64encode(found.png).decode()}" style="image-rendering: pixelated">'
+        f'<img src="data:image/png;base64,{b64encode(found.file).decode()}" style="image-rendering: pixelated">'
         f"<div>{_caption(array, found)}</div>"
     )
 

@@ -220,8 +220,8 @@ class Arrays:
         picture, said = await self._do(1 << 20 if isinstance(array, Preview) else array.nbytes, work)
         told = {"low": picture.low, "high": picture.high, "bad": picture.bad, "size": picture.size}
         told |= {"statistics": said, "preview": isinstance(array, Preview), **_when(sample)}
-        kind = next(kind for magic, kind in _MAGIC if picture.png.startswith(magic))
-        return Response(picture.png, headers={"x-picture": orjson.dumps(told).decode()}, media_type=kind)
+        kind = next(kind for magic, kind in _MAGIC if picture.file.startswith(magic))
+        return Response(picture.file, headers={"x-picture": orjson.dumps(told).decode()}, media_type=kind)
 
     async def colours(self, request: Request) -> Response:
         return reply(colours_of(request.query_params.get("map", "grey")))

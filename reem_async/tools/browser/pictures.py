@@ -124,7 +124,7 @@ class RenderedPicture:
         low, high: The numbers that were given the first and the last colour.
     """
 
-    png: bytes  # the file; it is a JPEG where `coarse` allows that
+    file: bytes  # PNG, or JPEG where `coarse` allows that
     low: float
     high: float
     bad: int  # how many numbers are NaN or infinite; they are magenta
@@ -280,7 +280,7 @@ class Preview:
         low, high = self.low if low is None else low, self.high if high is None else high
         found = paint(self._pixels(), colours, low, high, side=side, bgr=bgr)
         axes = [size for size, index in zip(self.shape, self.chosen, strict=True) if index is None]
-        return RenderedPicture(found.png, found.low, found.high, self.bad, (axes[1], axes[0]))
+        return RenderedPicture(found.file, found.low, found.high, self.bad, (axes[1], axes[0]))
 
     def _pixels(self) -> np.ndarray[Any, Any]:
         pixels = np.asarray(Image.open(io.BytesIO(self.file)))
