@@ -46,13 +46,13 @@ def look(address: str, over: threading.Event) -> None:
 
 @contextlib.contextmanager
 def attached(name: str, server: Server, file: str) -> Iterator[None]:
-    """One tool, with no option that says what to look for."""
+    """One tool, at `localhost` as without an option, so through the server's Unix socket."""
     if name == ALONE:
         yield
         return
     port, over = free_port(), threading.Event()
     words = [{"FILE": file, "PORT": str(port)}.get(word, word) for word in TOOLS[name]]
-    process = subprocess.Popen([*_REEM, *words, "--url", server.url], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([*_REEM, *words, "--url", f"redis://localhost:{server.port}"], stdout=subprocess.DEVNULL)
     if name == "page":
         threading.Thread(target=look, args=(f"http://127.0.0.1:{port}", over), daemon=True).start()
     try:
