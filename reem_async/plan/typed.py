@@ -126,7 +126,9 @@ def plain(value: Any, path: Path, carries: Callable[[Any], Any]) -> Any:
         return [plain(each, (*path, n), carries) for n, each in enumerate(value)]
     # The class of a path is that of its system.
     kind = next((each for each in _SCALARS if isinstance(value, each)), kind)
-    return stored(kind, value, path, carries) if _is_typed(kind) and carries(value) is None else value
+    # A set is refused where no annotation says that it is one: it would arrive as a list.
+    is_object = kind not in _SETS and _is_typed(kind) and carries(value) is None
+    return stored(kind, value, path, carries) if is_object else value
 
 
 def check_annotation(annotation: Any, path: Path) -> None:
