@@ -151,11 +151,10 @@ async def encoded(session: Session, names: Names, prefix: str, value: Any) -> En
 
 async def encoded_objects(session: Session, names: Names, prefix: str, value: Any) -> tuple[Any, Encoded]:
     """Return a value with what is sent in place of objects that cannot be stored as they are, and it encoded."""
-    try:
+    with contextlib.suppress(BadType):
         return value, await encoded(session, names, prefix, value)
-    except BadType:
-        value = plain(value, (names.keys.name, *names.path), session.ships.carries)
-        return value, await encoded(session, names, prefix, value)
+    value = plain(value, (names.keys.name, *names.path), session.ships.carries)
+    return value, await encoded(session, names, prefix, value)
 
 
 async def opened(session: Session, content: Content | None, prefix: str, where: str) -> Any:
