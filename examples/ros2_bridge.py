@@ -159,9 +159,8 @@ def load(file: str) -> Entry:
             short = min(len(each["path"]), len(other["path"]))
             both_read = each.get("direction") == other.get("direction") == "to_ros"
             if each["path"][:short] == other["path"][:short] and not both_read:
-                raise each.wrong(
-                    f"path {'.'.join(each['path'])} is used at {other.where}, too; use another one", "path"
-                )
+                name = ".".join(each["path"])
+                raise each.wrong(f"path {name} is used at {other.where}, too; use another one", "path")
     return found
 
 
@@ -315,8 +314,7 @@ def _numbers(form: str, value: Any, path: str, length: int | None) -> Any:
         raise ValueError(f"{path}: some numbers do not fit {numbers.dtype}")
     if length is not None:
         return numbers
-    code = numbers.dtype.char.replace("l", "q").replace("L", "Q")
-    return array.array(code, numbers.tobytes())
+    return array.array(numbers.dtype.char.replace("l", "q").replace("L", "Q"), numbers.tobytes())
 
 
 def _of_picture(picture: Any, encoding: Any, path: str) -> dict[str, Any]:
@@ -519,8 +517,7 @@ class Pair:
             refused = self._set(value)
             if refused is None:
                 self._agreed = value
-                return
-            if not refused:  # no answer
+            if not refused:  # taken, or no answer
                 return
             self._bridge.report(self.entry, f"{self.entry['name']} = {value!r:.60} was refused by ROS: {refused}")
         elif value is not None and in_ros not in (value, self.reported):
