@@ -238,9 +238,8 @@ _SCALARS: dict[Any, tuple[type | tuple[type, ...], Callable[[Any], Any], Callabl
 }
 
 
-_PLAIN = frozenset(
-    {*(str, int, float, bool, type(None), bytes, dict, list), np.ndarray}
-)  # what reading gives, but for ships
+# What reading gives where no ship does.
+_PLAIN = frozenset((str, int, float, bool, type(None), bytes, dict, list, np.ndarray))
 _DTYPES = (np.generic, bool, int, float, complex)
 
 # The classes that may be annotations, and what reading makes.
