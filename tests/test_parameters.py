@@ -191,7 +191,7 @@ def test_what_other_programs_store_out_of_range_is_ignored_and_reported_once(dec
         it.front.until(lambda: kp.invalid)
         assert (kp.value, kp.invalid[:11]) == (3.0, "control.kp:")
         reem.PublishSpace(store)["control"]["kp"] = 4.0
-        it.front.until(lambda: kp.value == 4.0)
+        it.front.until(lambda: kp.value == 4.0 and seen[-1:] == [4.0])
         assert not kp.invalid
         it.front.wait(kp.write(3.0))
     it.front.until(lambda: seen and seen[-1] == 3.0)
