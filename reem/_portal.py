@@ -17,6 +17,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 from reem_async.concurrency.locks import Inherited
@@ -129,6 +130,7 @@ class Portal:
         self._loop = asyncio.new_event_loop() if uvloop is None else uvloop.new_event_loop()
         self._calls: set[_Call[Any]] = set()
         self._ident: int | None = None
+        self._is_ending = False  # for the loop's thread
         self._last: Callable[[], Coroutine[Any, Any, None]] | None = None
         self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         try:
@@ -159,6 +161,7 @@ class Portal:
         finally:
             # One turn of the loop: calls that were handed over but not begun become tasks. Then all are cancelled.
             await asyncio.sleep(0)
+            self._is_ending = True
             left = asyncio.all_tasks() - {asyncio.current_task()}
             for task in left:
                 task.cancel()
@@ -180,12 +183,19 @@ class Portal:
         call = _Call(coroutine, self._calls)
         try:
             self._calls.add(call)  # before it is handed over: see `_serve`
-            self._hand_over(call.begin)
+            self._hand_over(partial(self._begin, call))
             return call.wait()
         except BaseException:
             if not call.over:
                 self._give_up(call)
             raise
+
+    def _begin(self, call: _Call[Any]) -> None:
+        """Start a call, unless the loop is about to be closed: nothing would cancel it any more."""
+        if self._is_ending:
+            call.end(_closed_meanwhile())
+        else:
+            call.begin()
 
     def _give_up(self, call: _Call[Any]) -> None:
         try:

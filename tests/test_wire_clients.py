@@ -276,11 +276,11 @@ def test_a_client_calls_a_service(client, url, key, name):
 
 
 @IN_C
+@pytest.mark.skipif(PLAIN, reason="there is no server with JSON")
 def test_a_client_ends_with_an_error_if_it_has_no_server(client):
     """The server stops during a watch; is not there; has no JSON module."""
     with EmbeddedServer() as server:
-        watch = Watch(client, server.url, "foo")
-        url = server.url
+        watch = Watch(client, url := server.url, "foo")
         assert watch.next() == (0, None)
     out, error = watch.process.communicate(timeout=PATIENCE)
     watch.close()
