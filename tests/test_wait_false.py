@@ -214,12 +214,15 @@ def test_calls_that_wait_share_transactions_and_each_gets_its_own_error(publishe
         front.write(["a", "end"], True)
         front.flush()
         assert admin.info("commandstats")["cmdstat_exec"]["calls"] - transactions < 30
-        arrived = []
+        arrived, has_gap = [], False
         while (update := next(watch)).path != "a.end":
             arrived.append((update.path, update.value if update.path == "a.n" else None))
             assert update.missed in (0, None)
+            has_gap |= update.gap
     good = [number for number in range(30) if number % 10 not in (5, 7)]
-    assert [value for path, value in arrived if path == "a.n" and value in good] == good
+    values = [value for path, value in arrived if path == "a.n" and value in good]
+    # After the read that a refused update leads to, some may be delivered once more: promise 25.
+    assert (list(dict.fromkeys(values)) if has_gap else values) == good
     assert_same(reader["a"].read(), {"n": 29, "image": np.full(3, 27), "x": 1, "y": 2, "end": True})
     assert [re.search(r"y\d+", error.__notes__[0])[0] for error in errors] == ["y5", "y15", "y25"]
     assert all(isinstance(error, PathRefused) for error in errors)
