@@ -103,7 +103,7 @@ def stand_back() -> None:
 
 
 def come_last() -> None:
-    """Come after all other programs for the processor from now on, with all threads begun later, where that can be.
+    """Give this thread, and all threads that it begins, the lowest priority, where the system allows that.
 
     Niceness decides how much a thread gets. A thread that was woken waits up to a whole turn of any other, 1.4 ms by
     default, so the turns are short. Linux with autogroup=1 shares processors among sessions first, where niceness

@@ -85,9 +85,11 @@ def _no_ship(_: Any) -> None:
 
 
 class _Way(NamedTuple):
+    """Whether objects are made of what is stored, or the reverse, and what both need."""
+
     reads: bool
     carries: Callable[[Any], Any] = _no_ship  # returns the ship that stores an object as it is, or None
-    # What dicts and lists are as choices of unions, by their ids: unions in unions would be tried again and again.
+    # Results of converting values to choices of unions, by both ids. Without them nested unions take exponential time.
     tried: dict[tuple[int, int], tuple[Any, Any, Any]] | None = None
 
 
@@ -97,7 +99,7 @@ def stored(annotation: Any, value: Any, path: Path, carries: Callable[[Any], Any
     Raises BadValue, which names path, expected and found, BadType or TooDeep.
     """
     try:
-        return _convert(annotation, value, path, _Way(False, carries))
+        return _convert(annotation, value, path, _Way(reads=False, carries=carries))
     except Mismatch as error:
         raise BadValue(str(error)) from None
     except RecursionError:
@@ -112,7 +114,7 @@ def made(annotation: Any, value: Any, path: Path) -> Any:
         BadType: The annotation cannot be used.
     """
     try:
-        return _convert(annotation, value, path, _Way(True, tried={}))
+        return _convert(annotation, value, path, _Way(reads=True, tried={}))
     except Mismatch as error:
         raise BadData(str(error)) from None
 
@@ -347,7 +349,7 @@ def _one_of(union: Any, value: Any, path: Path, way: _Way) -> Any:
     choices = get_args(union)
     chosen, result = _chosen(choices, value, path, way, _name(union))
     if not way.reads and len(choices) - (type(None) in choices) > 1:
-        read, _ = _chosen(choices, result, path, _Way(True, tried={}), _name(union))
+        read, _ = _chosen(choices, result, path, _Way(reads=True, tried={}), _name(union))
         if read is not chosen:
             raise BadType(
                 f"{show(path)}: in {_name(union)} this {_name(chosen)} would be read as {_name(read)}, since what is "

@@ -129,7 +129,7 @@ class RawWatch(Stream[RawUpdate]):
             self._follower.rate = rate
 
     def look(self, name: str) -> None:
-        """Have a key read that has no document of REEM any more."""
+        """Read a key at once: its document of REEM was replaced."""
         if self._follower is not None:
             self._follower.look(name)
 
@@ -226,7 +226,7 @@ class _Follower:
         # Keys that were there when they were last read, and whether each was a short string
         self._known: dict[str, bool] = {}
         self._documents: dict[str, float] = {}  # keys with documents of REEM, and when that was found
-        self._doubtful: set[str] = set()  # of these, keys that were changed since: another program may have them now
+        self._doubtful: set[str] = set()  # of these, keys that changed since: another program may have replaced them
         self._next_look = 0.0
         self._is_first = True
         self.turns = 0  # how often keys were read
@@ -334,14 +334,14 @@ class _Follower:
         self._mark(name for name in names if name not in documents)
 
     def _look_at_doubtful(self) -> None:
-        """Have keys read that were changed while they were taken to hold documents, once they are not any more."""
+        """Read changed keys again whose documents were found over `_DOCUMENT_SECONDS` ago."""
         since = time.monotonic() - _DOCUMENT_SECONDS
         names = [name for name in self._doubtful if self._documents.get(name, -math.inf) < since]
         self._doubtful.difference_update(names)
         self._mark(names)
 
     def look(self, name: str) -> None:
-        """Have a key read now that was taken to hold a document."""
+        """Read a key at once that held a document until now."""
         if self._documents.pop(name, None) is not None:
             self._mark([name])
 

@@ -71,7 +71,7 @@ class RawRecorder:
             await self._watch.caught_up(seconds)
 
     def look(self, name: str) -> bool:
-        """Have a key recorded that has no document of REEM any more; return whether such keys are recorded."""
+        """Record a key whose document of REEM was replaced; return whether such keys are recorded."""
         if self._is_on:
             self._watch.look(name)
         return self._is_on
